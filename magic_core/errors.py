@@ -1,0 +1,115 @@
+"""The one error tree of magic-slam.
+
+    MagicError                      UNKNOWN
+    ├── InvalidInput                INVALID_ARGUMENT     a value breaks a stated rule (field violations)
+    │   └── ConfigError             INVALID_ARGUMENT     a setting is unknown or out of range
+    ├── DataError                   FAILED_PRECONDITION  a dataset is missing or not in its layout
+    ├── NotFound                    NOT_FOUND            a named thing does not exist
+    ├── AlreadyExists               ALREADY_EXISTS       a name is taken by something else
+    ├── WrongState                  FAILED_PRECONDITION  the thing exists but cannot do this now
+    │   └── DescriptorModelMismatch FAILED_PRECONDITION  agent and session use different image encoders
+    ├── CorruptData                 DATA_LOSS            bytes do not match their checksum or format
+    ├── ResourceExhausted           RESOURCE_EXHAUSTED   a limit or quota is reached
+    ├── Unavailable                 UNAVAILABLE          try again later
+    ├── DeadlineExceeded            DEADLINE_EXCEEDED    the answer did not come in time
+    └── NotSupported                UNIMPLEMENTED        this build or version cannot do it
+
+Each class has one gRPC code and one ErrorInfo reason. `wire.errors` turns them into
+google.rpc.Status and back, so that a client catches the same class the server raised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FieldViolation:
+    """One field that breaks its rule: a dotted path and a sentence saying value, rule and remedy."""
+
+    field: str
+    description: str
+
+
+class MagicError(Exception):
+    """Base of every error this project raises on purpose."""
+
+    grpc_code = "UNKNOWN"
+    reason = "MAGIC_ERROR"
+
+    def __init__(self, message: str, *, violations: tuple[FieldViolation, ...] = ()) -> None:
+        super().__init__(message)
+        self.message = message
+        self.violations = violations
+
+    def __reduce__(self):  # errors cross process borders; keyword-only arguments need help
+        return _rebuild, (type(self), self.message, self.violations)
+
+
+def _rebuild(
+    cls: type[MagicError], message: str, violations: tuple[FieldViolation, ...]
+) -> MagicError:
+    return cls(message, violations=violations)
+
+
+class InvalidInput(MagicError):
+    grpc_code = "INVALID_ARGUMENT"
+    reason = "INVALID_INPUT"
+
+    @classmethod
+    def field(cls, name: str, description: str) -> InvalidInput:
+        """An error about one field."""
+        return cls(f"{name}: {description}", violations=(FieldViolation(name, description),))
+
+
+class ConfigError(InvalidInput):
+    reason = "CONFIG_ERROR"
+
+
+class DataError(MagicError):
+    grpc_code = "FAILED_PRECONDITION"
+    reason = "DATA_ERROR"
+
+
+class NotFound(MagicError):
+    grpc_code = "NOT_FOUND"
+    reason = "NOT_FOUND"
+
+
+class AlreadyExists(MagicError):
+    grpc_code = "ALREADY_EXISTS"
+    reason = "ALREADY_EXISTS"
+
+
+class WrongState(MagicError):
+    grpc_code = "FAILED_PRECONDITION"
+    reason = "WRONG_STATE"
+
+
+class DescriptorModelMismatch(WrongState):
+    reason = "DESCRIPTOR_MODEL_MISMATCH"
+
+
+class CorruptData(MagicError):
+    grpc_code = "DATA_LOSS"
+    reason = "CORRUPT_DATA"
+
+
+class ResourceExhausted(MagicError):
+    grpc_code = "RESOURCE_EXHAUSTED"
+    reason = "RESOURCE_EXHAUSTED"
+
+
+class Unavailable(MagicError):
+    grpc_code = "UNAVAILABLE"
+    reason = "UNAVAILABLE"
+
+
+class DeadlineExceeded(MagicError):
+    grpc_code = "DEADLINE_EXCEEDED"
+    reason = "DEADLINE_EXCEEDED"
+
+
+class NotSupported(MagicError):
+    grpc_code = "UNIMPLEMENTED"
+    reason = "NOT_SUPPORTED"
