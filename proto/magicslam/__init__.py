@@ -1,0 +1,1 @@
+"""The contract of magic-slam, generated from the .proto files beside it."""
