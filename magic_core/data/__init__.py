@@ -1,5 +1,7 @@
 """Sources of RGB-D frames: one layout per file behind one protocol."""
 
+from magic_core.data.discovery import open_dataset
 from magic_core.data.frame import Frame, FrameSource
+from magic_core.data.replica_writer import write_replica
 
-__all__ = ["Frame", "FrameSource"]
+__all__ = ["Frame", "FrameSource", "open_dataset", "write_replica"]
