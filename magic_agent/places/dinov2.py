@@ -52,9 +52,7 @@ def write_graph(weights: Weights, onnx_path: Path, *, image_size: tuple[int, int
         tokens = graph.block(tokens, f"blocks.{block}.")
     tokens = graph.layer_norm(tokens, "norm")
     embedding = graph.writer.node("ReduceMean", tokens, axes=[1], keepdims=0)
-    graph.writer.save(
-        onnx_path, image_size=image_size, output=embedding, dimension=graph.channels
-    )
+    graph.writer.save(onnx_path, image_size=image_size, output=embedding, dimension=graph.channels)
 
 
 def resized_positions(positions: NDArray, grid: tuple[int, int]) -> NDArray[np.float32]:

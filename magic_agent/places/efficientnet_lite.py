@@ -90,9 +90,7 @@ class _LiteGraph:
         if expands:
             inner = self.convolution(inner, f"{prefix}_expand_conv", f"{prefix}_bn0")
         inner = self.convolution(inner, f"{prefix}_depthwise_conv", f"{prefix}_bn1", stride=stride)
-        inner = self.convolution(
-            inner, f"{prefix}_project_conv", f"{prefix}_bn2", activation=False
-        )
+        inner = self.convolution(inner, f"{prefix}_project_conv", f"{prefix}_bn2", activation=False)
         return self.writer.node("Add", inner, value) if adds_input else inner
 
     def convolution(

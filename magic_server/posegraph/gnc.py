@@ -1,0 +1,103 @@
+"""Graduated non-convexity with truncated least squares (Yang et al. 2020) over GTSAM.
+
+Odometry is trusted; loops get weights in [0, 1]. Loops with no weight are *left out* of the
+linear system: with zero-weight factors in it, GTSAM's own GncLMOptimizer fills in and takes minutes.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_server.posegraph.arrays import EdgeArrays
+from magic_server.posegraph.optimiser import FactorCache, anchored, optimise
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+STEP = 1.4
+MAX_ROUNDS = 60
+ITERATIONS_PER_ROUND = 2
+LEAST_WEIGHT = 1e-3
+POLISH_ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class GncResult:
+    """Poses (n, 4, 4) and which loops (m,) they rest on."""
+
+    poses: Array
+    kept: NDArray[np.bool_]
+
+
+class RobustGraph:
+    """A component with trusted edges and doubtful loops, solved again and again."""
+
+    def __init__(self, odometry: EdgeArrays, loops: EdgeArrays, anchors: dict[int, Array]) -> None:
+        self.odometry = odometry
+        self.loops = loops
+        self._loop_factors = FactorCache(loops)
+        self._base = anchored(anchors)
+        odometry_factors = FactorCache(odometry)
+        for index in range(len(odometry)):
+            self._base.add(odometry_factors.factor(index))
+
+    def solve(self, poses: Array, weights: Array, *, max_iterations: int) -> Array:
+        """Optimise with the loops' weights (m,); weights below LEAST_WEIGHT are dropped."""
+        graph = self._base.clone()
+        for index in np.flatnonzero(weights > LEAST_WEIGHT).tolist():
+            graph.add(self._loop_factors.factor(index, float(weights[index])))
+        return optimise(graph, poses, max_iterations=max_iterations)
+
+    def truncated_cost(self, poses: Array, limit: float) -> float:
+        """Half the sum of odometry's squared norms and of the loops', cut at `limit` each."""
+        loops = np.minimum(self.loops.squared_norms(poses), limit)
+        return 0.5 * float(self.odometry.squared_norms(poses).sum() + loops.sum())
+
+
+def graduated(
+    graph: RobustGraph, poses: Array, *, limit: float, candidates: NDArray[np.bool_] | None = None
+) -> GncResult:
+    """Anneal from nearly convex to truncated least squares; `limit` is the chi-square bound.
+
+    `candidates` keeps the annealing to some loops; the polish may take up the others.
+    """
+    allowed = np.ones(len(graph.loops), bool) if candidates is None else candidates
+    squared = graph.loops.squared_norms(poses)
+    largest = float(squared[allowed].max(initial=0.0))
+    if largest > limit:
+        mu = limit / max(2.0 * largest - limit, 1e-9)
+        for _ in range(MAX_ROUNDS):
+            weights = np.where(allowed, _weights(squared, mu, limit), 0.0)
+            poses = graph.solve(poses, weights, max_iterations=ITERATIONS_PER_ROUND)
+            squared = graph.loops.squared_norms(poses)
+            decided = (weights < LEAST_WEIGHT) | (weights > 1.0 - LEAST_WEIGHT)
+            if mu > 1.0 and decided.all():
+                break
+            mu *= STEP
+    return polished(graph, poses, limit=limit)
+
+
+def polished(
+    graph: RobustGraph, poses: Array, *, limit: float, max_iterations: int = 20
+) -> GncResult:
+    """Alternate between keeping what fits and solving with it, until nothing changes."""
+    kept = graph.loops.squared_norms(poses) < limit
+    for _ in range(POLISH_ROUNDS):
+        poses = graph.solve(poses, kept.astype(float), max_iterations=max_iterations)
+        fits = graph.loops.squared_norms(poses) < limit
+        if (fits == kept).all():
+            break
+        kept = fits
+    return GncResult(poses=poses, kept=kept)
+
+
+def _weights(squared: Array, mu: float, limit: float) -> Array:
+    """Weights of truncated least squares at control parameter mu (equation 14 of the paper)."""
+    upper, lower = (mu + 1.0) / mu * limit, mu / (mu + 1.0) * limit
+    middle = np.sqrt(limit * mu * (mu + 1.0) / np.maximum(squared, 1e-12)) - mu
+    return np.where(squared >= upper, 0.0, np.where(squared <= lower, 1.0, np.clip(middle, 0, 1)))

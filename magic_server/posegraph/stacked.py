@@ -1,0 +1,76 @@
+"""Many rigid transforms at once: the formulas of magic_core.geometry.se3 on (n, 4, 4) stacks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL_ANGLE_RAD = 1e-4
+
+
+def inverse(transforms: Array) -> Array:
+    """Inverses of (n, 4, 4) transforms."""
+    rotations_t = transforms[..., :3, :3].swapaxes(-1, -2)
+    result = np.zeros_like(transforms)
+    result[..., :3, :3] = rotations_t
+    result[..., :3, 3] = -(rotations_t @ transforms[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def log(transforms: Array) -> Array:
+    """Tangent vectors (n, 6), (translation, rotation), of (n, 4, 4) transforms."""
+    phi = rotation_log(transforms[..., :3, :3])
+    translation = transforms[..., :3, 3]
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    safe = np.maximum(angle, _SMALL_ANGLE_RAD)
+    exact = (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2
+    factor = np.where(angle < _SMALL_ANGLE_RAD, 1.0 / 12.0, exact)
+    once = np.cross(phi, translation)
+    rho = translation - 0.5 * once + factor * np.cross(phi, once)
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def rotation_log(rotations: Array) -> Array:
+    """Rotation vectors (n, 3) of (n, 3, 3) rotations, exact near 0 and pi (by quaternions)."""
+    quaternions = quaternions_from_rotations(rotations)
+    w, xyz = quaternions[..., :1], quaternions[..., 1:]
+    norm = np.linalg.norm(xyz, axis=-1, keepdims=True)
+    half = np.arctan2(norm, w)
+    return xyz * np.where(norm < 1e-12, 2.0, 2.0 * half / np.maximum(norm, 1e-12))
+
+
+def rotation_angles(transforms: Array) -> Array:
+    """Rotation angles (n,) in radians of (n, 4, 4) transforms; fast, good to 1e-4 rad near 0."""
+    trace = np.trace(transforms[..., :3, :3], axis1=-2, axis2=-1)
+    return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+
+
+def quaternions_from_rotations(rotations: Array) -> Array:
+    """Unit quaternions (n, 4) wxyz, w >= 0, of (n, 3, 3) rotations (Bar-Itzhack's four cases)."""
+    m = rotations
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    yz, zx, xy = m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]
+    zy, xz, yx = m[..., 1, 2], m[..., 2, 0], m[..., 0, 1]
+    # Row r is 4 q_r times the quaternion; the row of the largest q_r is the accurate one.
+    rows = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, yz - zy, zx - xz, xy - yx], axis=-1),
+            np.stack([yz - zy, 1 + xx - yy - zz, xy + yx, zx + xz], axis=-1),
+            np.stack([zx - xz, xy + yx, 1 - xx + yy - zz, yz + zy], axis=-1),
+            np.stack([xy - yx, zx + xz, yz + zy, 1 - xx - yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    diagonal = np.stack([rows[..., i, i] for i in range(4)], axis=-1)
+    best = diagonal.argmax(axis=-1)[..., None, None]
+    chosen = np.take_along_axis(rows, best, axis=-2)[..., 0, :]
+    chosen = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
+    return np.where(chosen[..., :1] < 0, -chosen, chosen)
+
+
+def squared_norms(vectors: Array, information: Array) -> Array:
+    """Squared Mahalanobis norms (n,) of vectors (n, 6) under information (n, 6, 6)."""
+    return np.einsum("ni,nij,nj->n", vectors, information, vectors)
