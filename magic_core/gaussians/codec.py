@@ -1,0 +1,263 @@
+"""Gaussian clouds as bytes: a lossless layout and a compact, quantised one.
+
+Both begin with a fixed header and hold one zstd frame; docs/wire-format.md gives every byte.
+All numbers are little-endian. The layouts hold columns ("structure of arrays"), because equal
+things next to each other compress best.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from magic_core.errors import CorruptData, InvalidInput, ResourceExhausted
+from magic_core.gaussians.cloud import GaussianCloud
+
+MAGIC = b"MGSC"
+VERSION = 1
+LOSSLESS, COMPACT = 0, 1
+MAX_GAUSSIANS = 50_000_000
+
+_HEADER = struct.Struct("<4sBBHI")  # magic, version, layout, reserved, count
+_RANGES = struct.Struct("<3dd2f2f")  # origin xyz, step, log-scale range, colour range
+_LOSSLESS_BYTES, _COMPACT_BYTES = 56, 23
+_LOSSLESS_COLUMNS = (3, 4, 3, 1, 3)
+_QUATERNION_LEVELS = 1023
+_SQRT_HALF = 0.5**0.5
+
+
+@dataclass(frozen=True, slots=True)
+class CompactOptions:
+    """What the compact layout may lose."""
+
+    position_step_m: float = 0.0005
+    """Grid that positions snap to, metres; the error per axis is at most half of it."""
+    zstd_level: int = 6
+    """1 (fast) to 19 (small)."""
+
+
+def encode_lossless(cloud: GaussianCloud, *, zstd_level: int = 3) -> bytes:
+    """All five columns as float32, in order; decodes bit for bit."""
+    columns = b"".join(array.astype("<f4").tobytes() for array in cloud.arrays())
+    return _pack(LOSSLESS, len(cloud), columns, zstd_level)
+
+
+def encode_compact(cloud: GaussianCloud, options: CompactOptions = CompactOptions()) -> bytes:
+    """Quantised columns in Morton order; about a quarter of the lossless size.
+
+    Positions are off by at most half a step per axis, scales by at most 2 % over a range of
+    1:10,000, rotations by at most 0.25 degrees, opacities by 1/512, colours by 1/510 of their
+    range. Positions that do not fit 2^21 steps per axis get a coarser step.
+    """
+    grid, origin, step = _position_grid(cloud.means, options.position_step_m)
+    order = np.argsort(_morton(grid), kind="stable")
+    grid, cloud = grid[order], cloud.select(order)
+    log_scales = np.log(np.maximum(cloud.scales.astype(np.float64), 1e-12))
+    scale_range = _range(log_scales, 0.0, 0.0)
+    colour_range = _range(cloud.colours, 0.0, 1.0)
+    opacity = np.clip(cloud.opacities.astype(np.float64) * 256.0, 0.0, 255.0).astype(np.uint8)
+    payload = b"".join(
+        [
+            _RANGES.pack(*origin, step, *scale_range, *colour_range),
+            _planes(_zigzag(np.diff(grid, axis=0, prepend=0)).T),
+            _planes(_quaternion_codes(cloud.quaternions)),
+            _to_bytes(log_scales, scale_range).T.tobytes(),
+            opacity.tobytes(),
+            _to_bytes(cloud.colours, colour_range).T.tobytes(),
+        ]
+    )
+    return _pack(COMPACT, len(cloud), payload, options.zstd_level)
+
+
+def decode(data: bytes, *, max_gaussians: int = MAX_GAUSSIANS) -> GaussianCloud:
+    """Either layout back to a cloud.
+
+    Memory is bounded by the header's count, which is checked before anything is decompressed.
+    Raises CorruptData when the bytes are not in the format, ResourceExhausted when there are more
+    Gaussians than allowed, InvalidInput when a value is out of range.
+    """
+    layout, count = _read_header(data)
+    if count > max_gaussians:
+        raise ResourceExhausted(f"{count} Gaussians in one blob, at most {max_gaussians} allowed")
+    size = count * _LOSSLESS_BYTES
+    if layout == COMPACT:
+        size = _RANGES.size + count * _COMPACT_BYTES
+    payload = _unpack(data, size)
+    cloud = (_decode_lossless if layout == LOSSLESS else _decode_compact)(payload, count)
+    cloud.validate()
+    return cloud
+
+
+def gaussian_count(data: bytes) -> int:
+    """The number of Gaussians that the header claims; reads the first 12 bytes only."""
+    return _read_header(data)[1]
+
+
+def _read_header(data: bytes) -> tuple[int, int]:
+    """(layout, count)."""
+    if len(data) < _HEADER.size:
+        raise CorruptData(f"Gaussian blob of {len(data)} bytes, the header alone is {_HEADER.size}")
+    magic, version, layout, _, count = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise CorruptData(f"Gaussian blob starts with {magic!r}, expected {MAGIC!r}")
+    if version != VERSION or layout not in (LOSSLESS, COMPACT):
+        raise CorruptData(
+            f"Gaussian blob version {version}, layout {layout}: this build reads version "
+            f"{VERSION}, layouts {LOSSLESS} and {COMPACT}; update the older side"
+        )
+    return layout, count
+
+
+def _pack(layout: int, count: int, payload: bytes, level: int) -> bytes:
+    if count > MAX_GAUSSIANS:
+        raise InvalidInput(f"{count} Gaussians in one blob, at most {MAX_GAUSSIANS} allowed")
+    header = _HEADER.pack(MAGIC, VERSION, layout, 0, count)
+    return header + zstandard.ZstdCompressor(level=level).compress(payload)
+
+
+def _unpack(data: bytes, size: int) -> bytes:
+    """The zstd frame's content, which must be exactly `size` bytes."""
+    frame = data[_HEADER.size :]
+    try:
+        if zstandard.frame_content_size(frame) != size:
+            raise CorruptData(f"Gaussian payload does not hold the {size} bytes its count needs")
+        content = zstandard.ZstdDecompressor().decompress(
+            frame, max_output_size=size, allow_extra_data=False
+        )
+    except zstandard.ZstdError as error:
+        raise CorruptData(f"Gaussian payload is not a zstd frame: {error}") from error
+    if len(content) != size:
+        raise CorruptData(f"Gaussian payload is {len(content)} bytes, its count needs {size}")
+    return content
+
+
+def _decode_lossless(payload: bytes, count: int) -> GaussianCloud:
+    flat = np.frombuffer(payload, "<f4").astype(np.float32)
+    ends = np.cumsum([0, *(count * width for width in _LOSSLESS_COLUMNS)])
+    parts = [flat[a:b] for a, b in itertools.pairwise(ends)]
+    shapes = [count if width == 1 else (count, width) for width in _LOSSLESS_COLUMNS]
+    return GaussianCloud(*(p.reshape(shape) for p, shape in zip(parts, shapes, strict=True)))
+
+
+def _decode_compact(payload: bytes, count: int) -> GaussianCloud:
+    ox, oy, oz, step, scale_lo, scale_hi, colour_lo, colour_hi = _RANGES.unpack_from(payload)
+    if not np.isfinite([ox, oy, oz, step, scale_lo, scale_hi, colour_lo, colour_hi]).all():
+        raise InvalidInput.field("gaussians.ranges", "holds NaN or infinity")
+    raw = np.frombuffer(payload, np.uint8, offset=_RANGES.size)
+    deltas, raw = raw[: 12 * count], raw[12 * count :]
+    codes, raw = raw[: 4 * count], raw[4 * count :]
+    scales, raw = raw[: 3 * count], raw[3 * count :]
+    opacities, colours = raw[:count], raw[count:]
+    grid = np.cumsum(_unzigzag(_from_planes(deltas, (3, count))), axis=1, dtype=np.int64)
+    means = grid.T * step + np.array([ox, oy, oz])
+    with np.errstate(over="ignore"):
+        return GaussianCloud.from_arrays(
+            means,
+            _quaternions_of_codes(_from_planes(codes, (count,))),
+            scales=np.exp(_from_bytes(scales.reshape(3, count).T, (scale_lo, scale_hi))),
+            opacities=(opacities.astype(np.float64) + 0.5) / 256.0,
+            colours=_from_bytes(colours.reshape(3, count).T, (colour_lo, colour_hi)),
+        )
+
+
+def _position_grid(means: NDArray[np.float32], step: float) -> tuple[NDArray, NDArray, float]:
+    """Integer positions (n, 3), their origin (3,) and step in metres."""
+    if len(means) == 0:
+        return np.zeros((0, 3), np.int64), np.zeros(3), step
+    points = means.astype(np.float64)
+    origin = points.min(axis=0)
+    step = max(step, float((points.max(axis=0) - origin).max()) / (2**21 - 1))
+    return np.rint((points - origin) / step).astype(np.int64), origin, step
+
+
+def _morton(grid: NDArray) -> NDArray[np.uint64]:
+    """63-bit Morton codes (n,) of (n, 3) integers below 2^21."""
+    code = np.zeros(len(grid), np.uint64)
+    for axis in range(3):
+        x = grid[:, axis].astype(np.uint64)
+        for shift, mask in _SPREAD:
+            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+        code |= x << np.uint64(axis)
+    return code
+
+
+_SPREAD = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def _zigzag(values: NDArray) -> NDArray[np.uint32]:
+    """Signed to unsigned so that small magnitudes have small codes."""
+    return ((values << 1) ^ (values >> 63)).astype(np.uint32)
+
+
+def _unzigzag(codes: NDArray[np.uint32]) -> NDArray[np.int64]:
+    wide = codes.astype(np.int64)
+    return (wide >> 1) ^ -(wide & 1)
+
+
+def _planes(values: NDArray[np.uint32]) -> bytes:
+    """The bytes of the values, all lowest bytes first: the high planes compress to nothing."""
+    flat = np.ascontiguousarray(values, "<u4").reshape(-1)
+    return flat.view(np.uint8).reshape(-1, 4).T.tobytes()
+
+
+def _from_planes(data: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint32]:
+    return np.ascontiguousarray(data.reshape(4, -1).T).view("<u4").reshape(shape)
+
+
+def _range(values: NDArray, low: float, high: float) -> tuple[float, float]:
+    """The values' range as float32 numbers, at least (low, high) where those differ."""
+    if values.size == 0:
+        return low, high
+    found = (float(values.min()), float(values.max()))
+    found = (min(low, found[0]), max(high, found[1])) if low != high else found
+    return tuple(np.array(found, np.float32).tolist())
+
+
+def _to_bytes(values: NDArray, limits: tuple[float, float]) -> NDArray[np.uint8]:
+    low, high = limits
+    unit = (values.astype(np.float64) - low) / max(high - low, 1e-30)
+    return np.rint(np.clip(unit, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _from_bytes(codes: NDArray[np.uint8], limits: tuple[float, float]) -> NDArray[np.float64]:
+    low, high = limits
+    return low + codes.astype(np.float64) * ((high - low) / 255.0)
+
+
+def _quaternion_codes(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Smallest three: 2 bits say which component is left out, 10 bits for each other one."""
+    q = quaternions.astype(np.float64)
+    if len(q) == 0:
+        return np.zeros(0, np.uint32)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
+    largest = np.abs(q).argmax(axis=1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    rest = np.take_along_axis(q, _OTHERS[largest], axis=1)
+    unit = (rest / _SQRT_HALF + 1.0) / 2.0
+    levels = np.rint(np.clip(unit, 0.0, 1.0) * _QUATERNION_LEVELS).astype(np.uint32)
+    return largest.astype(np.uint32) << 30 | levels[:, 0] << 20 | levels[:, 1] << 10 | levels[:, 2]
+
+
+def _quaternions_of_codes(codes: NDArray[np.uint32]) -> NDArray[np.float64]:
+    largest = (codes >> 30).astype(np.int64)
+    levels = np.stack([codes >> 20 & 1023, codes >> 10 & 1023, codes & 1023], axis=-1)
+    rest = (levels.astype(np.float64) / _QUATERNION_LEVELS * 2.0 - 1.0) * _SQRT_HALF
+    missing = np.sqrt(np.maximum(1.0 - (rest**2).sum(axis=1), 0.0))
+    q = np.empty((len(codes), 4))
+    np.put_along_axis(q, _OTHERS[largest], rest, axis=1)
+    np.put_along_axis(q, largest[:, None], missing[:, None], axis=1)
+    return q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -1,0 +1,53 @@
+"""Settings of the gRPC transport, one definition for both ends.
+
+The default 4 MiB message limit stays: everything large is chunked. Keepalive pings faster than the
+server permits end a connection with GOAWAY too_many_pings, hence one place for both figures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Transport:
+    """Keepalive and message limits of both ends."""
+
+    keepalive_s: float = 30.0
+    """Idle time after which an end asks whether the other is still there."""
+    keepalive_timeout_s: float = 10.0
+    """Time without an answer after which the connection counts as lost."""
+    max_message_bytes: int = 4 << 20
+    """Largest single message, both ways."""
+
+
+def client_options(transport: Transport = Transport()) -> list[tuple[str, int]]:
+    """Channel arguments of a client; gRPC's own retry, which gives up silently, is off."""
+    return [
+        *_common(transport),
+        ("grpc.enable_retries", 0),
+        ("grpc.initial_reconnect_backoff_ms", 200),
+        ("grpc.min_reconnect_backoff_ms", 200),
+        ("grpc.max_reconnect_backoff_ms", 5000),
+    ]
+
+
+def server_options(transport: Transport = Transport()) -> list[tuple[str, int]]:
+    """Channel arguments of a server: it permits twice the client's ping rate."""
+    return [
+        *_common(transport),
+        ("grpc.http2.min_ping_interval_without_data_ms", int(transport.keepalive_s * 500)),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", int(transport.keepalive_s * 500)),
+        ("grpc.so_reuseport", 0),
+    ]
+
+
+def _common(transport: Transport) -> list[tuple[str, int]]:
+    return [
+        ("grpc.max_send_message_length", transport.max_message_bytes),
+        ("grpc.max_receive_message_length", transport.max_message_bytes),
+        ("grpc.keepalive_time_ms", int(transport.keepalive_s * 1000)),
+        ("grpc.keepalive_timeout_ms", int(transport.keepalive_timeout_s * 1000)),
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.max_pings_without_data", 0),
+    ]

@@ -1,0 +1,103 @@
+"""The error tree as google.rpc.Status and back, so that a client catches what the server raised."""
+
+from __future__ import annotations
+
+import grpc
+from google.protobuf import any_pb2
+from google.rpc import code_pb2, error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
+from magic_core import errors
+from magic_core.errors import FieldViolation, MagicError
+
+DOMAIN = "magicslam"
+MAX_DETAIL_CHARACTERS = 2000
+
+
+def status_of(error: MagicError) -> status_pb2.Status:
+    """A google.rpc.Status with ErrorInfo, and BadRequest when fields are violated."""
+    info = error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN)
+    details = [_packed(info)]
+    if error.violations:
+        bad = error_details_pb2.BadRequest()
+        for violation in error.violations:
+            bad.field_violations.add(
+                field=violation.field, description=violation.description[:MAX_DETAIL_CHARACTERS]
+            )
+        details.append(_packed(bad))
+    return status_pb2.Status(
+        code=code_pb2.Code.Value(error.grpc_code),
+        message=error.message[:MAX_DETAIL_CHARACTERS],
+        details=details,
+    )
+
+
+def grpc_status_of(error: MagicError) -> grpc.Status:
+    """The same as the (code, details, trailing metadata) that a servicer aborts with."""
+    return rpc_status.to_status(status_of(error))
+
+
+def error_of(call: grpc.RpcError) -> MagicError:
+    """The error that a failed call stands for: by its ErrorInfo reason, else by its gRPC code."""
+    code: grpc.StatusCode = call.code()  # type: ignore[attr-defined]
+    message = call.details() or code.name  # type: ignore[attr-defined]
+    reason, violations = _details(call)
+    kind = error_class(reason, code.name)
+    if kind is MagicError and reason is None:
+        message = f"{code.name}: {message}"
+    return kind(message, violations=violations)
+
+
+def error_class(reason: str | None, code: str) -> type[MagicError]:
+    """The class of an ErrorInfo reason, else of a gRPC code's name, else the base class."""
+    return _BY_REASON.get(reason) or _BY_CODE.get(code, MagicError)
+
+
+def _details(call: grpc.RpcError) -> tuple[str | None, tuple[FieldViolation, ...]]:
+    reason, violations = None, ()
+    status = _rich_status(call)
+    for detail in status.details if status is not None else ():
+        info, bad = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
+        if detail.Unpack(info) and info.domain == DOMAIN:
+            reason = info.reason
+        elif detail.Unpack(bad):
+            violations = tuple(FieldViolation(v.field, v.description) for v in bad.field_violations)
+    return reason, violations
+
+
+def _rich_status(call: grpc.RpcError) -> status_pb2.Status | None:
+    """The status in the trailing metadata, where the peer sent one that parses."""
+    for key, value in call.trailing_metadata() or ():  # type: ignore[attr-defined]
+        if key == "grpc-status-details-bin":
+            try:
+                return status_pb2.Status.FromString(value)
+            except ValueError:
+                return None
+    return None
+
+
+def _packed(message) -> any_pb2.Any:
+    packed = any_pb2.Any()
+    packed.Pack(message)
+    return packed
+
+
+def _tree(kind: type[MagicError]) -> list[type[MagicError]]:
+    return [kind, *(below for sub in kind.__subclasses__() for below in _tree(sub))]
+
+
+_CLASSES = _tree(MagicError)
+_BY_REASON: dict[str | None, type[MagicError]] = {kind.reason: kind for kind in _CLASSES}
+_BY_CODE: dict[str, type[MagicError]] = {
+    "INVALID_ARGUMENT": errors.InvalidInput,
+    "OUT_OF_RANGE": errors.InvalidInput,
+    "NOT_FOUND": errors.NotFound,
+    "ALREADY_EXISTS": errors.AlreadyExists,
+    "FAILED_PRECONDITION": errors.WrongState,
+    "ABORTED": errors.WrongState,
+    "DATA_LOSS": errors.CorruptData,
+    "RESOURCE_EXHAUSTED": errors.ResourceExhausted,
+    "UNAVAILABLE": errors.Unavailable,
+    "DEADLINE_EXCEEDED": errors.DeadlineExceeded,
+    "UNIMPLEMENTED": errors.NotSupported,
+}
