@@ -1,0 +1,203 @@
+"""The mapper of one agent: the active sub-map's Gaussians, its keyframes and their optimisation."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_agent.mapping.config import MappingConfig
+from magic_agent.mapping.keyframes import Window, moved_enough
+from magic_agent.mapping.seeder import Seeder
+from magic_core.data import Frame
+from magic_core.errors import WrongState
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import Camera, se3
+from magic_core.render import GaussianOptimiser, LossWeights, RenderedView
+from magic_core.submap import Keyframe
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MappingReport:
+    """What mapping did with one keyframe."""
+
+    seeded: int
+    pruned: int
+    iterations: int
+    loss: float
+    """Loss of the last step on this keyframe."""
+    gaussians: int
+    """Size of the sub-map afterwards."""
+    duration_ms: float
+
+
+class Mapper:
+    """Builds one sub-map at a time in the frame of its anchor (paper, "Mapping")."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: MappingConfig | None = None,
+        *,
+        threads: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._camera = camera
+        self._config = (config or MappingConfig()).resolved()
+        self._threads = threads
+        self._rng = np.random.default_rng(seed)
+        self._seeder = Seeder(camera, self._config, self._rng)
+        self._keyframes: list[Keyframe] = []
+        self._median_depths: list[float] = []
+        self._window = Window(self._config.newest_share, self._rng)
+        self._optimiser: GaussianOptimiser | None = None
+
+    @property
+    def config(self) -> MappingConfig:
+        """The settings in force, with the schedule's values put in."""
+        return self._config
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """Keyframes of the active sub-map; the first is the anchor."""
+        return tuple(self._keyframes)
+
+    def __len__(self) -> int:
+        return 0 if self._optimiser is None else len(self._optimiser)
+
+    def gaussians(self) -> GaussianCloud:
+        """The active sub-map, anchor frame."""
+        return self._active().gaussians()
+
+    def render(self, anchor_from_camera: Pose) -> RenderedView:
+        """The active sub-map as seen from a pose."""
+        return self._active().render(self._camera, anchor_from_camera)
+
+    def begin(self, frame: Frame, *, carried: GaussianCloud | None = None) -> MappingReport:
+        """Start a sub-map with this frame as anchor; carried Gaussians are in its frame."""
+        self._keyframes, self._median_depths = [], []
+        self._window = Window(self._config.newest_share, self._rng)
+        self._optimiser = GaussianOptimiser(
+            carried if carried is not None else GaussianCloud.empty(),
+            weights=LossWeights(
+                ssim=self._config.ssim_weight,
+                depth=self._config.depth_weight,
+                scale=self._config.regularisation_weight,
+            ),
+            threads=self._threads,
+        )
+        return self.insert(frame, se3.identity())
+
+    def wants(self, frame: Frame, anchor_from_camera: Pose) -> bool:
+        """Whether this frame should become a keyframe."""
+        gap = frame.index - self._keyframes[-1].frame_index
+        if self._config.keyframe_every > 0:
+            return gap >= self._config.keyframe_every
+        rule = self._config.keyframes
+        if gap < rule.min_gap:
+            return False
+        return (
+            gap >= rule.max_gap
+            or moved_enough(
+                self._keyframes[-1].anchor_from_camera,
+                anchor_from_camera,
+                median_depth=self._median_depths[-1],
+                config=rule,
+            )
+            or self._novelty(frame, anchor_from_camera) > rule.novelty
+        )
+
+    def insert(self, frame: Frame, anchor_from_camera: Pose) -> MappingReport:
+        """Take a frame in as keyframe: seed, optimise, prune."""
+        started = time.perf_counter()
+        seeded = self._seed(frame, anchor_from_camera)
+        self._keyframes.append(
+            Keyframe(frame.index, frame.timestamp_s, anchor_from_camera, frame.colour, frame.depth)
+        )
+        valid = frame.depth[frame.depth > 0]
+        self._median_depths.append(float(np.median(valid)) if len(valid) else 1.0)
+        self._window.add()
+        iterations, loss = self._optimise()
+        pruned = self._prune()
+        duration_ms = 1e3 * (time.perf_counter() - started)
+        return MappingReport(seeded, pruned, iterations, loss, len(self), duration_ms)
+
+    def split(self, anchor_from_next: Pose) -> tuple[GaussianCloud, GaussianCloud]:
+        """(sent, kept): what the next anchor cannot see; what it sees, moved to its frame.
+
+        Every Gaussian is in exactly one of the two (paper, "Mapping").
+        """
+        gaussians = self.gaussians()
+        visible = self.render(anchor_from_next).visible
+        kept = gaussians.select(visible).transformed(se3.inverse(anchor_from_next))
+        return gaussians.select(~visible), kept
+
+    def _seed(self, frame: Frame, anchor_from_camera: Pose) -> int:
+        optimiser = self._active()
+        room = self._config.max_gaussians - len(optimiser)
+        if room <= 0:
+            return 0
+        view = self.render(anchor_from_camera) if len(optimiser) else None
+        seeds = self._seeder.seeds(
+            frame, view, limit=room, existing=self._means_seen(view, anchor_from_camera)
+        )
+        if len(seeds):
+            optimiser.extend(seeds.transformed(anchor_from_camera))
+        return len(seeds)
+
+    def _means_seen(
+        self, view: RenderedView | None, anchor_from_camera: Pose
+    ) -> NDArray[np.float32]:
+        """Means of the visible Gaussians in the camera frame (uniform seeding sizes by them)."""
+        if view is None or self._config.seeding != "uniform":
+            return np.zeros((0, 3), np.float32)
+        means = self.gaussians().means[view.visible]
+        return se3.transform_points(se3.inverse(anchor_from_camera), means).astype(np.float32)
+
+    def _novelty(self, frame: Frame, anchor_from_camera: Pose) -> float:
+        return float(self._seeder.need(frame, self.render(anchor_from_camera)).mean())
+
+    def _optimise(self) -> tuple[int, float]:
+        """Run the budgeted steps; stop early once the newest keyframe has settled."""
+        first = len(self._keyframes) == 1
+        budget = self._config.anchor_iterations if first else self._config.iterations
+        newest, losses = len(self._keyframes) - 1, []
+        for done in range(1, budget + 1):
+            index = self._window.choose()
+            keyframe = self._keyframes[index]
+            report = self._active().step(
+                self._camera, keyframe.anchor_from_camera, keyframe.colour, keyframe.depth
+            )
+            self._window.report(index, report.loss)
+            if index == newest:
+                losses.append(report.loss)
+            if _settled(losses, self._config.settle):
+                return done, losses[-1]
+        return budget, losses[-1] if losses else float("nan")
+
+    def _prune(self) -> int:
+        gaussians = self.gaussians()
+        largest = self._config.prune_scale * float(np.median(self._median_depths))
+        keep = (gaussians.opacities >= self._config.prune_opacity) & (
+            gaussians.scales.max(axis=1, initial=0.0) <= largest
+        )
+        if not keep.all():
+            self._active().prune(keep)
+        return int((~keep).sum())
+
+    def _active(self) -> GaussianOptimiser:
+        if self._optimiser is None:
+            raise WrongState("the mapper has no sub-map yet: call begin() with the first frame")
+        return self._optimiser
+
+
+def _settled(losses: list[float], share: float, span: int = 4) -> bool:
+    """Whether the last `span` losses gained less than `share` of the loss per step."""
+    if share <= 0.0 or len(losses) < 2 * span:
+        return False
+    before, after = np.mean(losses[-2 * span : -span]), np.mean(losses[-span:])
+    return bool(before - after < share * span * after)
