@@ -1,0 +1,79 @@
+"""Settings of registration and verification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from magic_core.errors import ConfigError
+
+Method = Literal["visual", "kiss", "fpfh"]
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationConfig:
+    """How two views are registered and which results count. Gates: measured on real pairs of
+    anchors, see benchmarks/loops."""
+
+    methods: tuple[Method, ...] = ("visual", "kiss")
+    """Coarse methods, each giving hypotheses: `visual` (SIFT with depth), `kiss` (KISS-Matcher),
+    `fpfh` (the paper's FPFH + RANSAC)."""
+    seed: int = 0
+    """Seed of all random sampling; the same views give the same result."""
+    max_hypotheses: int = 3
+    """Hypotheses per method that are refined and compared."""
+
+    max_keyframes: int = 0
+    """How many images besides the anchor's are used, where the view has them."""
+    max_depth_m: float = 6.0
+    """Farther readings are ignored."""
+    max_width: int = 360
+    """Images wider than this are halved first (until they are not)."""
+    pyramid_levels: int = 3
+    """Sizes of the refinement, each half the one before."""
+    cloud_voxel_m: float = 0.02
+    """Voxel size of the point clouds of the coarse methods."""
+    max_keypoints: int = 1500
+    """SIFT keypoints per image."""
+
+    depth_sigma_m: float = 0.0025
+    """Noise of a depth reading near the camera."""
+    depth_sigma_per_m: float = 0.003
+    """Its growth with the squared distance (per metre squared, beyond 0.4 m)."""
+    texture_sigma: float = 0.35
+    """Noise of the contrast-normalised intensity (which has standard deviation about 1)."""
+    correlated_pixels: float = 60.0
+    """Neighbouring residuals are not independent: so many count as one in the information."""
+    systematic_m: float = 0.003
+    """Error of translation that no number of pixels averages out."""
+    systematic_rad: float = 0.0015
+    """The same for rotation."""
+
+    min_inliers: int = 10
+    """Least inliers of the coarse method (its own count)."""
+    min_overlap: float = 0.15
+    """Least share of either view's readings that the other one confirms."""
+    min_fitness: float = 0.5
+    """Least share of the readings that fall on readings of the other view and agree in depth."""
+    max_rmse_m: float = 0.04
+    """Largest point-to-plane root mean square of agreeing readings."""
+    min_texture_correlation: float = 0.3
+    """Least correlation of contrast-normalised intensity where both views agree in depth."""
+    max_free_space: float = 0.15
+    """Largest share of readings that stand in space which the other view saw through."""
+    min_information: float = 100.0
+    """Least eigenvalue of the information, 1/m^2 and 1/rad^2 (100: 10 cm, 0.1 rad)."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.methods if name not in ("visual", "kiss", "fpfh")]
+        if unknown or not self.methods:
+            raise ConfigError.field(
+                "registration.methods", f"{self.methods}: expected some of visual, kiss, fpfh"
+            )
+        if self.pyramid_levels < 1 or self.max_hypotheses < 1 or self.max_keyframes < 0:
+            raise ConfigError.field(
+                "registration", "pyramid_levels and max_hypotheses are at least 1"
+            )
+        for name in ("cloud_voxel_m", "max_depth_m", "depth_sigma_m", "texture_sigma"):
+            if getattr(self, name) <= 0:
+                raise ConfigError.field(f"registration.{name}", "must be > 0")

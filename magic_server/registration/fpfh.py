@@ -1,0 +1,62 @@
+"""FPFH features and RANSAC (Rusu et al. 2009), the paper's coarse registration, with Open3D."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+
+from magic_server.registration.coarse import Hypothesis
+from magic_server.registration.config import RegistrationConfig
+from magic_server.registration.view import PreparedView
+
+VOXEL_M = 0.05
+ITERATIONS = 100_000
+CONFIDENCE = 0.999
+LEAST_POINTS = 50
+
+registration = o3d.pipelines.registration
+
+
+class FpfhRansac:
+    """One hypothesis. Deterministic by Open3D's global seed and one OpenMP thread."""
+
+    def propose(
+        self, source: PreparedView, target: PreparedView, config: RegistrationConfig
+    ) -> list[Hypothesis]:
+        source_cloud, source_features = _features(source)
+        target_cloud, target_features = _features(target)
+        if min(len(source_cloud.points), len(target_cloud.points)) < LEAST_POINTS:
+            return []
+        o3d.utility.random.seed(config.seed)
+        result = registration.registration_ransac_based_on_feature_matching(
+            source_cloud,
+            target_cloud,
+            source_features,
+            target_features,
+            True,
+            VOXEL_M * 1.5,
+            registration.TransformationEstimationPointToPoint(False),
+            3,
+            [
+                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                registration.CorrespondenceCheckerBasedOnDistance(VOXEL_M * 1.5),
+            ],
+            registration.RANSACConvergenceCriteria(ITERATIONS, CONFIDENCE),
+        )
+        inliers = len(result.correspondence_set)
+        if not inliers:
+            return []
+        return [Hypothesis(np.array(result.transformation), inliers, "fpfh")]
+
+
+def _features(view: PreparedView) -> tuple[Any, Any]:
+    """The thinned cloud with normals, and its FPFH features."""
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(view.points.astype(np.float64)))
+    cloud = cloud.voxel_down_sample(VOXEL_M)
+    search = o3d.geometry.KDTreeSearchParamHybrid(radius=VOXEL_M * 2, max_nn=30)
+    cloud.estimate_normals(search)
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
+    wide = o3d.geometry.KDTreeSearchParamHybrid(radius=VOXEL_M * 5, max_nn=100)
+    return cloud, registration.compute_fpfh_feature(cloud, wide)
