@@ -1,0 +1,197 @@
+"""One agent: frames in, sub-maps out, corrected poses back; asyncio around the local engine.
+
+The event loop only moves things: frames are read, tracked, mapped and encoded on executors. A slow
+or absent server never stops tracking, and a slow tracker holds back the reader through a bounded
+queue (or, with `rate_hz`, makes it drop frames, as a live camera would).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_agent.client import MagicClient
+from magic_agent.config import AgentConfig
+from magic_agent.places import DescriptorModel
+from magic_agent.slam import FrameResult, LocalSlam
+from magic_agent.spool import Spool
+from magic_agent.tally import Tally
+from magic_agent.uplink import Uplink
+from magic_core.data import Frame, FrameSource
+from magic_core.errors import DeadlineExceeded, Unavailable
+from magic_core.geometry import se3
+from magic_core.submap import Submap
+from magic_core.wire import names
+from magic_core.wire.records import CorrectedPose, PoseSnapshot, SubmapReceipt
+
+log = logging.getLogger(__name__)
+
+Observer = Callable[[str, dict], None]
+"""Called with an event name (`frame`, `submap`, `revision`) and its figures."""
+
+
+class Agent:
+    """Runs one frame source against one server until the source ends or `stop` is called."""
+
+    def __init__(
+        self,
+        source: FrameSource,
+        client: MagicClient,
+        *,
+        session: str,
+        name: str,
+        config: AgentConfig,
+        model: DescriptorModel,
+        folder: Path,
+        observer: Observer = lambda event, figures: None,
+    ) -> None:
+        self.tally = Tally(name)
+        self.corrections: dict[int, CorrectedPose] = {}
+        """Newest correction per sub-map index."""
+        self._source = source
+        self._client = client
+        self._session = session
+        self._name = name
+        self._config = config
+        self._model = model
+        self._observer = observer
+        self._spool = Spool(folder / "spool")
+        self._stopping = asyncio.Event()
+        self._frames: asyncio.Queue[Frame | None] = asyncio.Queue(config.queue_frames)
+        self._slam_thread = ThreadPoolExecutor(1, f"slam-{name}")
+        self._io_threads = ThreadPoolExecutor(2, f"io-{name}")
+        self.world_from_camera: NDArray[np.float64] = se3.identity()
+        """Newest camera pose in the corrected world of the agent's component."""
+
+    def stop(self) -> None:
+        """Leave early: finish the current sub-map, send what there is, and end."""
+        self._stopping.set()
+
+    async def run(self) -> Tally:
+        """Run to the end. Raises the server's refusals; a lost connection is waited out."""
+        start = time.monotonic()
+        try:
+            await self._run()
+        finally:
+            self._slam_thread.shutdown(wait=False, cancel_futures=True)
+            self._io_threads.shutdown(wait=False, cancel_futures=True)
+            self.tally.wall_s = time.monotonic() - start
+        return self.tally
+
+    async def _run(self) -> None:
+        registration = await self._client.register_agent(
+            self._session,
+            self._name,
+            model_id=self._model.model_id,
+            dimension=self._model.dimension,
+        )
+        slam = LocalSlam(
+            self._source.camera,
+            self._config,
+            session=self._session,
+            agent=self._name,
+            describe=self._model.describe,
+            first_submap_index=max([registration.next_submap_index, *self._spooled_indices()]),
+            world_from_anchor_prior=self._prior(),
+        )
+        uplink = Uplink(
+            self._client,
+            self._spool,
+            config=self._config.uplink,
+            executor=self._io_threads,
+            on_spooled=lambda _, sizes: self.tally.wire_bytes.append(sizes),
+            on_receipt=self._on_receipt,
+        )
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._read_frames())
+            watching = group.create_task(self._watch_corrections())
+            sending = group.create_task(uplink.run())
+            await self._process_frames(slam, uplink)
+            await uplink.close()
+            await sending
+            await self._finish()
+            watching.cancel()
+
+    def _prior(self) -> NDArray[np.float64] | None:
+        """The known start, only when the user asked for it (the paper's setting)."""
+        return self._source[0].world_from_camera if self._config.known_start else None
+
+    def _spooled_indices(self) -> list[int]:
+        """The indices after those that an earlier run of this agent left in the spool."""
+        return [index + 1 for index in self._spool.pending()]
+
+    async def _read_frames(self) -> None:
+        loop = asyncio.get_running_loop()
+        start = loop.time()
+        for number in range(len(self._source)):
+            if self._stopping.is_set():
+                break
+            if self._config.rate_hz:
+                await asyncio.sleep(max(0.0, start + number / self._config.rate_hz - loop.time()))
+                if self._frames.full():
+                    self.tally.dropped_frames += 1
+                    continue
+            frame = await loop.run_in_executor(self._io_threads, self._source.__getitem__, number)
+            await self._frames.put(frame)
+        await self._frames.put(None)
+
+    async def _process_frames(self, slam: LocalSlam, uplink: Uplink) -> None:
+        loop = asyncio.get_running_loop()
+        while (frame := await self._frames.get()) is not None:
+            result = await loop.run_in_executor(self._slam_thread, slam.process, frame)
+            self._count(result)
+            await self._hand_over(result.finished, uplink)
+        last = await loop.run_in_executor(self._slam_thread, slam.finish)
+        await self._hand_over(last, uplink)
+
+    async def _hand_over(self, submap: Submap | None, uplink: Uplink) -> None:
+        if submap is not None:
+            self.tally.add_submap(submap)
+            await uplink.put(submap)
+
+    def _count(self, result: FrameResult) -> None:
+        self.tally.add_frame(result)
+        correction = self.corrections.get(result.submap_index)
+        if correction is not None:
+            self.world_from_camera = correction.world_from_anchor @ result.anchor_from_camera
+        self._observer(
+            "frame",
+            {"frames": self.tally.frames, "of": len(self._source), "lost": self.tally.lost_frames},
+        )
+
+    def _on_receipt(self, index: int, receipt: SubmapReceipt) -> None:
+        self.tally.acknowledged += 1
+        self._observer("submap", {"submaps": self.tally.acknowledged, "index": index})
+
+    async def _watch_corrections(self) -> None:
+        """Apply every revision of the pose graph; reconnect for as long as the agent runs."""
+        while True:
+            with contextlib.suppress(Unavailable, DeadlineExceeded):
+                watch = self._client.watch_corrected_poses(self._session, agent=self._name)
+                async for snapshot in watch:
+                    self._apply(snapshot)
+            await asyncio.sleep(self._config.uplink.longest_retry_s)
+
+    def _apply(self, snapshot: PoseSnapshot) -> None:
+        """Take over a new solution: one pose per sub-map, nothing is rewritten."""
+        self.corrections = {
+            names.parse_submap(name)[2]: pose for name, pose in snapshot.poses.items()
+        }
+        self.tally.revisions_seen += 1
+        self._observer("revision", {"revision": snapshot.revision})
+
+    async def _finish(self) -> None:
+        """Tell the server that no more will come; nothing there waits for it."""
+        try:
+            await self._client.finish_agent(self._session, self._name)
+            self.tally.completed = True
+        except (Unavailable, DeadlineExceeded) as error:
+            log.warning("%s: could not say goodbye: %s", self._name, error)

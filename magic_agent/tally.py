@@ -1,0 +1,92 @@
+"""What one agent counted while it ran, and the tracked trajectory that its sub-maps add up to."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_agent.slam import FrameResult
+from magic_core.evaluation import AgentReport, Trajectory, WireBytes
+from magic_core.geometry import Camera, se3
+from magic_core.submap import Submap
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counters of one agent; `report` turns them into the record that evaluation reads."""
+
+    agent: str
+    frames: int = 0
+    lost_frames: int = 0
+    dropped_frames: int = 0
+    """Frames skipped because the source ran in real time and the agent could not keep up."""
+    acknowledged: int = 0
+    """Sub-maps that the server has said are durable."""
+    revisions_seen: int = 0
+    """Revisions of the pose graph that reached the agent while it ran."""
+    completed: bool = False
+    """True when every sub-map was acknowledged and the server knows that no more will come."""
+    wall_s: float = 0.0
+    keyframes: list[int] = field(default_factory=list)
+    tracking_ms: list[float] = field(default_factory=list)
+    mapping_ms: list[float] = field(default_factory=list)
+    wire_bytes: list[WireBytes] = field(default_factory=list)
+    first_frames: list[int] = field(default_factory=list)
+    _odometry_from_anchor: NDArray[np.float64] = field(default_factory=se3.identity)
+    _tracked: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)
+
+    def add_frame(self, result: FrameResult) -> None:
+        """Count one processed frame."""
+        self.frames += 1
+        self.lost_frames += int(result.lost)
+        self.tracking_ms.append(round(result.tracking_ms, 3))
+        self.mapping_ms.append(round(result.mapping_ms, 3))
+        if result.is_keyframe:
+            self.keyframes.append(result.frame_index)
+
+    def add_submap(self, submap: Submap) -> None:
+        """Append a finished sub-map's frames to the trajectory in the agent's odometry frame."""
+        if submap.odometry is not None:
+            self._odometry_from_anchor = (
+                self._odometry_from_anchor @ submap.odometry.previous_from_anchor
+            )
+        elif self._tracked:  # a new odometry chain: nothing better is known than the last pose
+            self._odometry_from_anchor = self._tracked[-1][1]
+        self.first_frames.append(submap.trajectory[0].frame_index)
+        self._tracked += [
+            (frame.timestamp_s, self._odometry_from_anchor @ frame.anchor_from_camera)
+            for frame in submap.trajectory
+        ]
+
+    def trajectory(self) -> Trajectory:
+        """The tracked trajectory: odometry alone, no correction."""
+        return Trajectory.from_poses(self._tracked)
+
+    def report(self, *, camera: Camera, dataset: str, scale: float) -> AgentReport:
+        """The record for `agents/{agent}/report.json`."""
+        return AgentReport(
+            agent=self.agent,
+            frames=self.frames,
+            lost_frames=self.lost_frames,
+            submaps=len(self.first_frames),
+            keyframes=tuple(self.keyframes),
+            camera=camera,
+            dataset=dataset,
+            scale=scale,
+            tracking_ms=tuple(self.tracking_ms),
+            mapping_ms=tuple(self.mapping_ms),
+            wire_bytes=tuple(self.wire_bytes),
+            peak_rss_bytes=peak_rss_bytes(),
+            wall_s=round(self.wall_s, 3),
+            submap_first_frames=tuple(self.first_frames),
+        )
+
+
+def peak_rss_bytes() -> int:
+    """Largest resident memory of this process so far."""
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kilobytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
