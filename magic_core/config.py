@@ -66,13 +66,27 @@ def from_mapping(cls: type[T], mapping: Any) -> T:
 
     Raises ConfigError that names every unknown setting and every value of a wrong type.
     """
+    if not isinstance(mapping, dict):
+        raise ConfigError(f"{cls.__name__}: {mapping!r} is not a mapping of settings to values")
     try:
         return _converter().structure(mapping, cls)
     except cattrs.BaseValidationError as error:
-        texts = [text.replace("$.", "") for text in cattrs.transform_error(error)]
+        texts = [
+            text.replace("$.", "")
+            for text in cattrs.transform_error(error, format_exception=_describe)
+        ]
         found = tuple(FieldViolation(text.rsplit("@", 1)[-1].strip(), text) for text in texts)
         message = f"{cls.__name__}: " + "; ".join(texts)
         raise ConfigError(message, violations=found) from error
+
+
+def _describe(error: BaseException, expected: type | None) -> str:
+    """cattrs' own words for unknown settings; the value itself for a wrong one."""
+    if isinstance(error, cattrs.ForbiddenExtraKeysError):
+        return f"unknown setting {', '.join(sorted(error.extra_fields))}"
+    if isinstance(error, AttributeError):
+        return "expected a mapping of settings to values"
+    return str(error) or f"expected {expected}"
 
 
 def load_yaml(cls: type[T], path: Path) -> T:

@@ -1,0 +1,155 @@
+"""One run on this machine: a server, one process per agent, and the session that they share.
+
+Whatever happens to single agents, the run goes on: what arrived is merged. A first Ctrl-C lets
+the agents leave early and still merges; a second one ends at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from magic_agent.client import MagicClient
+from magic_cli import processes
+from magic_cli.agent import AgentCommand
+from magic_cli.collect import collect, collect_map, write_ground_truth
+from magic_cli.processes import Child
+from magic_cli.progress import RunProgress
+from magic_cli.run import RunConfig, agent_settings, server_settings
+from magic_core.config import save_yaml
+from magic_core.data import FrameSource
+from magic_core.errors import DataError
+from magic_core.evaluation import RunFolder
+
+SESSION = "run"
+SERVER_START_TIMEOUT_S = 120.0
+
+
+@dataclass(slots=True)
+class Outcome:
+    """How a run went, apart from its accuracy."""
+
+    agents: dict[str, str] = field(default_factory=dict)
+    """agent -> `completed`, or how it ended instead."""
+    mapping_s: float = 0.0
+    """From the first agent's start to the last one's end."""
+    merge_s: float = 0.0
+    gaussians: int = 0
+
+
+class LocalRun:
+    """Starts and follows the processes of one run, then collects what the server knows."""
+
+    def __init__(self, config: RunConfig, sources: list[FrameSource], folder: RunFolder) -> None:
+        self._config = config
+        self._sources = sources
+        self._folder = folder
+        self._agents: list[Child] = []
+        self._interrupts = 0
+        self._outcome = Outcome()
+
+    async def run(self) -> Outcome:
+        """Run to the end. Raises DataError when not a single sub-map arrived."""
+        with self._interruptible(), RunProgress(self._sources) as progress:
+            server = await self._start_server()
+            try:
+                target = (await processes.wait_ready(server, timeout_s=SERVER_START_TIMEOUT_S))[
+                    "target"
+                ]
+                await self._run_agents(target, progress)
+                await self._finish(target, progress)
+            finally:
+                for child in self._agents:
+                    await processes.stop(child, timeout_s=5.0)
+                await processes.stop(server)
+        return self._outcome
+
+    async def _start_server(self) -> Child:
+        path = self._folder.server_folder / "config.yaml"
+        save_yaml(server_settings(self._config, self._folder.server_folder), path)
+        return await processes.start(
+            "server",
+            ["serve", "--config", str(path), "--progress", "json"],
+            log=self._folder.server_folder / "log.txt",
+            threads=1,
+        )
+
+    async def _run_agents(self, target: str, progress: RunProgress) -> None:
+        start = time.perf_counter()
+        threads = self._config.threads or processes.fair_threads(len(self._sources))
+        async with asyncio.TaskGroup() as group:
+            for source in self._sources:
+                child = await self._start_agent(source.name, target, threads)
+                self._agents.append(child)
+                group.create_task(self._follow(child, progress))
+        self._outcome.mapping_s = time.perf_counter() - start
+
+    async def _start_agent(self, name: str, target: str, threads: int) -> Child:
+        folder = self._folder.agents_folder / name
+        command = AgentCommand(
+            dataset=self._config.dataset,
+            name=name,
+            server=target,
+            session=SESSION,
+            out=self._folder.path,
+            scale=self._config.scale,
+            frames=self._config.frames,
+            stride=self._config.stride,
+            progress="json",
+            **agent_settings(self._config),
+        )
+        save_yaml(command, folder / "config.yaml")
+        arguments = ["agent", "--config", str(folder / "config.yaml")]
+        return await processes.start(name, arguments, log=folder / "log.txt", threads=threads)
+
+    async def _follow(self, child: Child, progress: RunProgress) -> None:
+        code = await processes.follow(child, progress.agent)
+        state = "completed" if code == 0 else f"ended with exit code {code}"
+        self._outcome.agents[child.name] = state
+        progress.agent_ended(child.name, state)
+        if code != 0:
+            progress.say(f"{child.name} {state}; the run goes on without it. Its log ends:")
+            progress.say(child.tail())
+
+    async def _finish(self, target: str, progress: RunProgress) -> None:
+        write_ground_truth(self._folder, self._sources)
+        async with MagicClient(target) as client:
+            if not await client.list_sessions() or not await client.list_submaps(SESSION):
+                logs = self._folder.agents_folder
+                raise DataError(f"no sub-map reached the server; see the agents' logs in {logs}")
+            start = time.perf_counter()
+            info = await collect_map(
+                client,
+                SESSION,
+                self._folder,
+                timeout_s=self._config.merge_timeout_s,
+                progress=progress.merge,
+            )
+            self._outcome.merge_s = time.perf_counter() - start
+            self._outcome.gaussians = info.gaussian_count
+            await collect(client, SESSION, self._folder)
+
+    @contextlib.contextmanager
+    def _interruptible(self):
+        loop = asyncio.get_running_loop()
+        task = asyncio.current_task()
+        assert task is not None
+
+        def interrupt() -> None:
+            self._interrupts += 1
+            if self._interrupts > 1 or not self._agents:
+                task.cancel()
+            for child in self._agents:
+                processes.ask_to_stop(child)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, interrupt)
+        try:
+            yield
+        finally:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.remove_signal_handler(number)

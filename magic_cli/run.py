@@ -1,0 +1,106 @@
+"""`magic run DATASET`: map a dataset on this machine, end to end.
+
+Starts a server and one process per agent_* folder, waits until all agents are done, merges the
+map, and writes one run folder with trajectories, map, metrics and an HTML report.
+
+Examples:
+  magic run ~/recordings/office --scale 0.5
+  magic run DATASET --tracking.solver adam --json
+  magic run DATASET --config runs/office/config.yaml --out runs/again
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from magic_agent.config import AgentConfig
+from magic_cli.options import parse
+from magic_cli.output import print_json
+from magic_core.config import field_names, save_yaml
+from magic_server.config import ServerConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunConfig(AgentConfig):
+    """Options of `magic run`."""
+
+    dataset: Positional[str]
+    """Folder of a dataset, or synthetic://flat?agents=3&frames=120."""
+    out: Path | None = None
+    """Run folder; default runs/{dataset}-{time}."""
+    scale: float = 1.0
+    """Process images at this fraction of their size."""
+    frames: int | None = None
+    """Use only so many frames of each agent."""
+    stride: int = 1
+    """Use every n-th frame."""
+    loops: Literal["on", "off"] = "on"
+    """`off` leaves loop closure out: every agent keeps its own odometry (an ablation)."""
+    merge_timeout_s: float = 3600.0
+    """Longest wait for the merged map."""
+    report: bool = True
+    """Write report.html and overview.png."""
+    server: ServerConfig = field(default_factory=ServerConfig)
+    """The server's settings; its address and folder are chosen by the run."""
+    json: bool = False
+    """Print one JSON object as the last line."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run a dataset; 0 when a map was made."""
+    config = parse(RunConfig, arguments, prog="magic run", description=__doc__ or "")
+    config.validate()
+    metrics = run(config)
+    if config.json:
+        print_json(metrics)
+    return 0
+
+
+def run(config: RunConfig) -> dict:
+    """Run a dataset and return its metrics (the contract of `magic run --json`)."""
+    from magic_cli.local_run import LocalRun
+    from magic_cli.summary import print_summary
+    from magic_core.data import open_dataset
+    from magic_core.evaluation import RunFolder
+
+    start = time.perf_counter()
+    sources = open_dataset(
+        config.dataset, scale=config.scale, max_frames=config.frames, stride=config.stride
+    )
+    folder = RunFolder(config.out or default_out(config.dataset)).create()
+    save_yaml(config, folder.config_path)
+    outcome = asyncio.run(LocalRun(config, sources, folder).run())
+    from magic_cli.evaluation import measure
+
+    metrics = measure(folder, sources, outcome=outcome, report=config.report, started=start)
+    print_summary(metrics, folder)
+    return metrics
+
+
+def default_out(dataset: str) -> Path:
+    """runs/{dataset}-{local time}."""
+    name = Path(dataset.split("?", 1)[0].split("://")[-1]).name or "run"
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def agent_settings(config: RunConfig) -> dict:
+    """The settings that a run hands on to its agents."""
+    return {name: getattr(config, name) for name in field_names(AgentConfig)}
+
+
+def server_settings(config: RunConfig, folder: Path) -> ServerConfig:
+    """The server's settings with what the run decides put in."""
+    return dataclasses.replace(
+        config.server,
+        host="127.0.0.1",
+        port=0,
+        data_dir=folder,
+        loops=dataclasses.replace(config.server.loops, enabled=config.loops == "on"),
+    )
