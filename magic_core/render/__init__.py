@@ -1,1 +1,26 @@
-"""TBD"""
+"""Rendering of Gaussian clouds: CPU kernels with gradients, mapping iterations, torch API.
+
+Names are imported when first used, so that importing the package costs neither numba nor torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from magic_core.render.rasteriser import Gradients, Rasteriser, RenderedView
+
+_HOMES = {
+    "Gradients": "rasteriser",
+    "Rasteriser": "rasteriser",
+    "RenderedView": "rasteriser",
+}
+
+__all__ = ["Gradients", "Rasteriser", "RenderedView"]
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
