@@ -1,0 +1,111 @@
+"""Settings of the tracker; units stand in the names, defaults are the measured best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from magic_core.errors import ConfigError
+from magic_core.render.linearisation import ResidualModel
+
+Solver = Literal["gauss_newton", "gn", "adam"]
+Initialisation = Literal[
+    "constant_velocity", "dense", "rgbd_odometry", "point_to_plane", "coloured_icp"
+]
+
+
+@dataclass(frozen=True, slots=True)
+class GaussNewtonConfig:
+    """Second-order refinement against the rendered sub-map."""
+
+    levels: int = 4
+    """Pyramid levels, the full image included; coarse to fine."""
+    finest_level: int = 0
+    """Level at which to stop; 0 is the full image."""
+    iterations: tuple[int, ...] = (4, 5, 6, 8)
+    """Most iterations per level, full image first; the last number serves all coarser levels."""
+    renders: int = 2
+    """Most renders of the sub-map per frame."""
+    rerender_pixels: float = 3.0
+    """Render again where the solution lies farther than this from the pose of the last render."""
+    converged_pixels: float = 0.02
+    """A level is done when a step moves the image by less than this, in pixels of that level."""
+    photometric: bool = True
+    """Estimate gain and bias of each frame."""
+    gain_deviation: float = 0.1
+    """Expected deviation of the gain from 1."""
+    bias_deviation: float = 0.05
+    """Expected deviation of the bias from 0, in units of full scale."""
+    alpha_power: int = 3
+    """Soft alpha mask: alpha to this power (paper, supplementary: 3)."""
+    inlier_factor: float = 50.0
+    """Inlier mask: depth errors beyond this many medians are left out (paper: 50)."""
+    residuals: ResidualModel = field(default_factory=ResidualModel)
+    """Noise model and robust widths."""
+    pixels_per_sample: float = 60.0
+    """Neighbouring residuals are correlated: this many pixels count as one measurement."""
+    prior_translation_m: float = 0.05
+    """Deviation of the motion prior; it decides only where the images do not."""
+    prior_rotation_deg: float = 3.0
+    """Deviation of the motion prior; it decides only where the images do not."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdamConfig:
+    """The paper's first-order refinement (section Tracking; supplementary, hyperparameters)."""
+
+    iterations: int = 60
+    """Gradient steps per frame (paper: 60 on Replica, 200 on Aria)."""
+    rotation_rate: float = 2e-4
+    """Learning rate of the rotation (paper: 2e-4 on Replica, 2e-3 on Aria)."""
+    translation_rate: float = 2e-3
+    """Learning rate of the translation (paper: 2e-3 on Replica, 1e-2 on Aria)."""
+    colour_weight: float = 0.95
+    """lambda_c, the weight of colour against depth (paper: 0.95 on Replica, 0.6 on Aria)."""
+    alpha_power: int = 3
+    """Soft alpha mask: alpha to this power (paper: 3)."""
+    inlier_factor: float = 50.0
+    """Inlier mask: errors beyond this many medians are left out (paper: 50)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LostConfig:
+    """When a pose is not to be believed."""
+
+    min_inlier_share: float = 0.4
+    """Least share of visible depths that agree with the sub-map."""
+    min_visible_share: float = 0.1
+    """Least share of the image that shows known parts of the sub-map."""
+    max_colour_error: float = 0.15
+    """Largest median colour residual, in units of full scale, after gain and bias."""
+    max_jump_m: float = 0.35
+    """Largest translation between consecutive frames."""
+    max_turn_deg: float = 25.0
+    """Largest rotation between consecutive frames."""
+    min_valid_depth_share: float = 0.02
+    """Least share of pixels with a depth reading for a frame to be tracked with depth."""
+    min_contrast: float = 0.01
+    """Least standard deviation of the grey image, in units of full scale (black frames)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """How each frame's pose is found."""
+
+    solver: Solver = "gauss_newton"
+    """Refinement against the sub-map; `gn` is short for gauss_newton, `adam` is the paper's."""
+    initialisation: Initialisation = "dense"
+    """Registration to the previous frame that starts the refinement."""
+    rotation_prealignment: bool = True
+    """Align the rotation on tiny images first where the prediction does not fit (fast turns)."""
+    gauss_newton: GaussNewtonConfig = field(default_factory=GaussNewtonConfig)
+    adam: AdamConfig = field(default_factory=AdamConfig)
+    lost: LostConfig = field(default_factory=LostConfig)
+
+    def __post_init__(self) -> None:
+        if self.solver == "gn":
+            object.__setattr__(self, "solver", "gauss_newton")
+        if not 1 <= self.gauss_newton.levels <= 8:
+            raise ConfigError.field("tracking.gauss_newton.levels", "expected 1 to 8")
+        if self.gauss_newton.renders < 1:
+            raise ConfigError.field("tracking.gauss_newton.renders", "expected at least 1")

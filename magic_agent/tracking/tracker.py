@@ -1,0 +1,187 @@
+"""The tracker of one camera: where was this frame taken, and can that be believed?
+
+A frame passes through: prediction (constant velocity), rotation pre-alignment where the
+prediction does not fit, registration to the previous frame, refinement against the rendered
+sub-map, and a verdict. The sub-map enters as a function that renders it, so the tracker knows no
+mapper. Poses are relative to the sub-map's anchor.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_agent.tracking.config import TrackingConfig
+from magic_agent.tracking.gauss_newton import MotionPrior
+from magic_agent.tracking.initialisation import make_initialiser
+from magic_agent.tracking.pyramid_cache import PyramidCache
+from magic_agent.tracking.refinement import (
+    GaussNewtonRefiner,
+    ReferenceView,
+    Refinement,
+    Refiner,
+)
+from magic_agent.tracking.result import StageClock, TrackingResult
+from magic_agent.tracking.rotation import align_rotation
+from magic_agent.tracking.verdict import judge
+from magic_core.data import Frame
+from magic_core.geometry import Camera, se3
+
+logger = logging.getLogger(__name__)
+
+Pose = NDArray[np.float64]
+
+_TURN_GAIN = 0.6  # pre-alignment must bring the colour cost below this share to be believed
+
+
+class Tracker:
+    """Finds the pose of one frame after another; keeps nothing but prepared images."""
+
+    def __init__(self, camera: Camera, config: TrackingConfig | None = None) -> None:
+        self._camera = camera
+        self._config = config or TrackingConfig()
+        self._pyramids = PyramidCache(camera, self._config.gauss_newton.levels)
+        self._initialiser = make_initialiser(self._config, self._pyramids)
+        self._refiner = _make_refiner(camera, self._config)
+
+    @property
+    def config(self) -> TrackingConfig:
+        """The settings in force."""
+        return self._config
+
+    def reset(self) -> None:
+        """Forget the frames seen so far (after a jump of the camera or a lost track)."""
+        self._initialiser.reset()
+
+    def track(
+        self,
+        frame: Frame,
+        previous: Frame,
+        *,
+        anchor_from_previous: Pose,
+        anchor_from_before_previous: Pose | None = None,
+        reference: ReferenceView,
+    ) -> TrackingResult:
+        """Find `anchor_from_camera` of a frame.
+
+        Args:
+            frame: the new frame.
+            previous: the frame before it, tracked successfully.
+            anchor_from_previous: its pose.
+            anchor_from_before_previous: the pose of the frame before that, for the prediction;
+                None predicts no motion.
+            reference: renders the sub-map as seen from a pose `anchor_from_camera`.
+        """
+        clock = StageClock()
+        predicted = _constant_velocity(anchor_from_previous, anchor_from_before_previous)
+        with clock.stage("pyramid"):
+            image = self._pyramids.get(frame)
+        with clock.stage("initialisation"):
+            start = self._start(frame, previous, predicted)
+        refinement = self._refiner.refine(
+            frame,
+            image,
+            anchor_from_camera=anchor_from_previous @ start,
+            reference=reference,
+            clock=clock,
+        )
+        return self._result(
+            frame,
+            refinement,
+            anchor_from_previous=anchor_from_previous,
+            predicted=predicted,
+            clock=clock,
+        )
+
+    def refine(
+        self, frame: Frame, *, anchor_from_camera: Pose, reference: ReferenceView
+    ) -> TrackingResult:
+        """Refine a pose that is known already, without a previous frame: at the seam between
+        sub-maps, or after relocalisation."""
+        clock = StageClock()
+        with clock.stage("pyramid"):
+            image = self._pyramids.get(frame)
+        refinement = self._refiner.refine(
+            frame, image, anchor_from_camera=anchor_from_camera, reference=reference, clock=clock
+        )
+        return self._result(
+            frame,
+            refinement,
+            anchor_from_previous=anchor_from_camera,
+            predicted=np.eye(4),
+            clock=clock,
+        )
+
+    def _start(self, frame: Frame, previous: Frame, predicted: Pose) -> Pose:
+        """previous_from_current before refinement."""
+        if self._config.rotation_prealignment:
+            fit = align_rotation(
+                self._pyramids.get(previous),
+                self._pyramids.get(frame),
+                previous_from_current=predicted,
+            )
+            if fit.cost_after < _TURN_GAIN * fit.cost_before:
+                predicted = fit.previous_from_current
+        initial = self._initialiser.estimate(
+            previous, frame, camera=self._camera, predicted_previous_from_current=predicted
+        )
+        if not initial.ok:
+            logger.debug("frame %d: initialisation failed, using the prediction", frame.index)
+        return initial.previous_from_current
+
+    def _result(
+        self,
+        frame: Frame,
+        refinement: Refinement,
+        *,
+        anchor_from_previous: Pose,
+        predicted: Pose,
+        clock: StageClock,
+    ) -> TrackingResult:
+        config = self._config.gauss_newton
+        prior = MotionPrior.around(np.eye(4), config).information
+        information = refinement.information(config.pixels_per_sample)
+        judgement = judge(
+            frame,
+            refinement,
+            previous_from_camera=se3.inverse(anchor_from_previous) @ refinement.anchor_from_camera,
+            information=information,
+            prior=prior,
+            config=self._config.lost,
+        )
+        lost = judgement.verdict == "lost"
+        alignment = refinement.alignment
+        return TrackingResult(
+            anchor_from_camera=(
+                anchor_from_previous @ predicted if lost else refinement.anchor_from_camera
+            ),
+            information=prior if lost else information + prior,
+            verdict=judgement.verdict,
+            reason=judgement.reason,
+            inlier_share=judgement.inlier_share,
+            visible_share=judgement.visible_share,
+            cost=alignment.equations.mean_cost,
+            colour_error=alignment.model.colour_sigma,
+            eigenvalues=judgement.eigenvalues,
+            gain=alignment.gain,
+            bias=alignment.bias,
+            renders=refinement.renders,
+            stages_ms=clock.stages_ms,
+        )
+
+
+def _make_refiner(camera: Camera, config: TrackingConfig) -> Refiner:
+    if config.solver == "adam":
+        from magic_agent.tracking.adam import AdamRefiner  # loads torch only when asked for
+
+        return AdamRefiner(config.adam, config.gauss_newton)
+    return GaussNewtonRefiner(config.gauss_newton)
+
+
+def _constant_velocity(anchor_from_previous: Pose, anchor_from_before: Pose | None) -> Pose:
+    """previous_from_current if the last motion repeats itself."""
+    if anchor_from_before is None:
+        return se3.identity()
+    return se3.orthonormalised(se3.inverse(anchor_from_before) @ anchor_from_previous)
