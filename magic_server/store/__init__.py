@@ -1,1 +1,31 @@
-"""TBD"""
+"""What a server remembers: SQLite beside a content-addressed blob folder."""
+
+from magic_server.store.agents import require_model
+from magic_server.store.blobs import BlobFolder, BlobWriter
+from magic_server.store.maps import NewMap, OpenOperation
+from magic_server.store.rows import (
+    AgentRow,
+    MapFile,
+    NewSubmap,
+    SessionRow,
+    StoredSubmap,
+    Vertex,
+)
+from magic_server.store.store import Store
+from magic_server.store.submaps import FirstAnswer
+
+__all__ = [
+    "AgentRow",
+    "BlobFolder",
+    "BlobWriter",
+    "FirstAnswer",
+    "MapFile",
+    "NewMap",
+    "NewSubmap",
+    "OpenOperation",
+    "SessionRow",
+    "Store",
+    "StoredSubmap",
+    "Vertex",
+    "require_model",
+]

@@ -1,0 +1,126 @@
+"""Where heavy work runs: a protocol, and a pool of spawned processes behind it.
+
+A job is a module-level function and plain arguments; it reads images from disk by path, so that
+little crosses the border. A cluster scheduler fits behind the same protocol.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import multiprocessing
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from magic_core.errors import ConfigError, Unavailable
+from magic_server.jobs.worker import prepare_worker
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class JobConfig:
+    """The processes that compute."""
+
+    workers: int = 2
+    """Processes; registration, pose graphs and merging share them."""
+    threads_per_worker: int = 1
+    """Threads of the numerical libraries in each."""
+    merge_threads: int = 0
+    """Threads of a merge's rasteriser; 0 takes one per core."""
+    niceness: int = 5
+    """Added to the workers' niceness, so that requests are answered while they compute."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1 or self.threads_per_worker < 1 or self.merge_threads < 0:
+            raise ConfigError.field("jobs", "workers and threads_per_worker are at least 1")
+
+
+class JobExecutor(Protocol):
+    """Runs functions elsewhere."""
+
+    @property
+    def workers(self) -> int:
+        """How many jobs run at once."""
+        ...
+
+    async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
+        """The function's result, or the error it raised. Unavailable when the worker died twice."""
+        ...
+
+    async def close(self) -> None:
+        """End the workers; jobs under way are lost."""
+        ...
+
+
+class ProcessExecutor:
+    """Jobs in spawned processes on this machine; a job whose worker dies is tried once more."""
+
+    def __init__(self, config: JobConfig = JobConfig()) -> None:
+        self._config = config
+        self._pool = self._new_pool()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def workers(self) -> int:
+        """How many jobs run at once."""
+        return self._config.workers
+
+    async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
+        """The function's result, or the error it raised. Unavailable when the worker died twice."""
+        for last in (False, True):
+            pool = self._pool
+            try:
+                # Submitting may start a process, which takes longer than the event loop can spare.
+                future = await asyncio.to_thread(pool.submit, function, *arguments)
+                return await _result(future)
+            except BrokenProcessPool as error:
+                if self._closed:
+                    raise Unavailable("the server is stopping") from error
+                self._replace(pool)
+                name = getattr(function, "__name__", str(function))
+                logger.warning("a worker died during %s", name)
+                if last:
+                    raise Unavailable(f"workers died twice during {name}") from error
+        raise AssertionError("unreachable")
+
+    async def close(self) -> None:
+        """End the workers; jobs under way are lost."""
+        self._closed = True
+        await asyncio.to_thread(_end, self._pool)
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        config = self._config
+        return ProcessPoolExecutor(
+            config.workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=prepare_worker,
+            initargs=(config.threads_per_worker, config.niceness),
+        )
+
+    def _replace(self, broken: ProcessPoolExecutor) -> None:
+        with self._lock:
+            if self._pool is broken:
+                self._pool = self._new_pool()
+        broken.shutdown(wait=False)
+
+
+async def _result(future: Future[T]) -> T:
+    return await asyncio.wrap_future(future)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Stop a pool without waiting for jobs that may take minutes."""
+    # The pool offers no way to end running jobs before Python 3.14 (terminate_workers).
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for worker in workers:
+        worker.terminate()
+    for worker in workers:
+        worker.join(timeout=5.0)

@@ -1,0 +1,168 @@
+"""The jobs: functions that run in a worker process. They read blobs from disk by path."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from magicslam.v1 import submap_pb2
+
+from magic_core.wire import decode_submap, geometry, images
+from magic_server.store.rows import StoredSubmap
+
+if TYPE_CHECKING:
+    from magic_server.globalmap import MergeConfig
+    from magic_server.posegraph import PoseGraphConfig, PoseGraphProblem, PoseGraphSolution
+    from magic_server.registration import AnchorView, RegistrationConfig, RegistrationResult
+
+_PROGRESS_INTERVAL_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedFiles:
+    """A stored sub-map and where the pose graph puts it."""
+
+    name: str
+    stored: StoredSubmap
+    world_from_anchor: np.ndarray  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class MergeTask:
+    """What a merge needs."""
+
+    submaps: tuple[PlacedFiles, ...]
+    config: MergeConfig
+    threads: int
+    """Threads of the rasteriser; 0 for one per core."""
+    folder: Path
+    """An empty folder for the results and the progress file."""
+
+
+@dataclass(frozen=True, slots=True)
+class MergeOutcome:
+    """What a merge made: files in its folder."""
+
+    gaussian_count: int
+    ply: Path
+    lossless: Path
+    compact: Path
+
+
+def verify_loop(
+    source: StoredSubmap, target: StoredSubmap, config: RegistrationConfig
+) -> RegistrationResult:
+    """Register the views of two sub-maps."""
+    from magic_server.registration import register
+
+    return register(
+        _view(source, config.max_keyframes), _view(target, config.max_keyframes), config
+    )
+
+
+def solve_pose_graph(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSolution:
+    """Solve a session's pose graph."""
+    from magic_server.posegraph import solve
+
+    return solve(problem, config)
+
+
+def merge_submaps(task: MergeTask) -> MergeOutcome:
+    """Merge placed sub-maps and write the map in every format."""
+    threads = task.threads or os.cpu_count() or 1
+    os.environ["MAGIC_THREADS"] = str(threads)
+    from magic_core.gaussians import codec
+    from magic_core.gaussians.ply import write_ply
+    from magic_server.globalmap import PlacedSubmap, build_global_map
+
+    report = _progress_writer(task.folder / "progress.json")
+    report(0.0, "reading sub-maps")
+    placed = [
+        PlacedSubmap(_read_submap(item.stored), item.world_from_anchor) for item in task.submaps
+    ]
+    config = task.config
+    if not config.threads:
+        config = dataclasses.replace(config, threads=threads)
+    cloud = build_global_map(placed, config, progress=report).cloud
+    outcome = MergeOutcome(
+        len(cloud), *(task.folder / name for name in ("map.ply", "map.lossless", "map.compact"))
+    )
+    write_ply(outcome.ply, cloud)
+    outcome.lossless.write_bytes(codec.encode_lossless(cloud))
+    outcome.compact.write_bytes(codec.encode_compact(cloud))
+    return outcome
+
+
+def read_progress(folder: Path) -> tuple[float, str] | None:
+    """(share done, stage) that a merge last reported into its folder, or None."""
+    try:
+        share, stage = json.loads((folder / "progress.json").read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+    return float(share), str(stage)
+
+
+@functools.lru_cache(maxsize=16)
+def _view(stored: StoredSubmap, max_keyframes: int) -> AnchorView:
+    """The images of a sub-map that registration wants; the anchor's and some keyframes'."""
+    from magic_server.registration import AnchorView
+
+    header = submap_pb2.SubmapHeader.FromString(stored.header)
+    camera = geometry.camera_from_proto(header.camera)
+    others = range(1, len(header.keyframes))
+    if len(others) > max_keyframes:
+        spread = np.linspace(1, len(header.keyframes) - 1, max_keyframes)
+        others = sorted(set(np.rint(spread).astype(int).tolist()))
+    colour, depth = _images(header, stored, 0)
+    keyframes = []
+    for index in others:
+        pose = geometry.pose_from_proto(header.keyframes[index].anchor_from_camera)
+        keyframes.append((pose, *_images(header, stored, index)))
+    return AnchorView(camera=camera, colour=colour, depth=depth, keyframes=tuple(keyframes))
+
+
+def _images(
+    header: submap_pb2.SubmapHeader, stored: StoredSubmap, keyframe: int
+) -> tuple[np.ndarray, np.ndarray]:
+    message = header.keyframes[keyframe]
+    size = (header.camera.width, header.camera.height)
+    colour = images.decode_colour(
+        stored.blobs[message.colour_blob].read_bytes(),
+        header.blobs[message.colour_blob].media_type,
+        size=size,
+    )
+    depth = images.decode_depth(
+        stored.blobs[message.depth_blob].read_bytes(),
+        metres_per_unit=header.blobs[message.depth_blob].metres_per_unit,
+        size=size,
+    )
+    return colour, depth
+
+
+def _read_submap(stored: StoredSubmap):
+    header = submap_pb2.SubmapHeader.FromString(stored.header)
+    return decode_submap(header, [path.read_bytes() for path in stored.blobs])
+
+
+def _progress_writer(path: Path) -> Callable[[float, str], None]:
+    """Replaces the progress file in one step, a few times a second at most."""
+    last = -1.0
+
+    def report(share: float, stage: str) -> None:
+        nonlocal last
+        if time.monotonic() - last < _PROGRESS_INTERVAL_S and 0.0 < share < 1.0:
+            return
+        last = time.monotonic()
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps([share, stage]))
+        partial.replace(path)
+
+    return report

@@ -1,0 +1,211 @@
+"""Sessions and agents in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sqlalchemy as sa
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from magic_core.errors import DescriptorModelMismatch, NotFound, WrongState
+from magic_core.wire import names, records
+from magic_server.store.database import Database
+from magic_server.store.rows import AgentRow, SessionRow, moment
+from magic_server.store.schema import agents, loops, sessions, snapshots, submaps
+
+
+class AgentTable:
+    """Sessions and their agents."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    async def register(
+        self, session: str, agent: str, *, model_id: str, dimension: int, now: float
+    ) -> tuple[AgentRow, bool]:
+        """The agent, and whether it was there before.
+
+        Raises DescriptorModelMismatch when the session is pinned to another encoder, WrongState
+        when the agent has finished.
+        """
+        async with self._database.write() as connection:
+            pinned = await _pinned_session(
+                connection, session, model_id=model_id, dimension=dimension, now=now
+            )
+            found = await _find_agent(connection, pinned, agent)
+            if found is None:
+                values = {"session_id": pinned.id, "name": agent, "finished": False}
+                values |= {"registered_at": now, "last_seen_at": now}
+                added = await connection.execute(sa.insert(agents), values)
+                return AgentRow(_new_id(added), pinned, agent, False), False
+            if found.finished:
+                name = names.agent_name(session, agent)
+                raise WrongState(f"{name} has finished; register under another agent name")
+            await _touch(connection, found.id, now)
+            return found, True
+
+    async def finish(self, session: str, agent: str, *, now: float) -> int:
+        """Mark an agent as done; returns its number of sub-maps. Idempotent."""
+        found = await self.agent(session, agent)
+        async with self._database.write() as connection:
+            change = sa.update(agents).where(agents.c.id == found.id)
+            await connection.execute(change.values(finished=True, last_seen_at=now))
+            count = sa.select(sa.func.count()).where(submaps.c.agent_id == found.id)
+            return await connection.scalar(count) or 0
+
+    async def session(self, session: str) -> SessionRow:
+        """A session; NotFound when there is none of that name."""
+        async with self._database.read() as connection:
+            found = await _find_session(connection, session)
+        if found is None:
+            raise NotFound(f"{names.session_name(session)} does not exist; register an agent first")
+        return found
+
+    async def agent(self, session: str, agent: str) -> AgentRow:
+        """An agent; NotFound when there is none of that name."""
+        row = await self.session(session)
+        async with self._database.read() as connection:
+            found = await _find_agent(connection, row, agent)
+        if found is None:
+            raise NotFound(f"{names.agent_name(session, agent)} does not exist; register it first")
+        return found
+
+    async def sessions(self) -> list[SessionRow]:
+        """Every session, oldest first."""
+        async with self._database.read() as connection:
+            rows = await connection.execute(sa.select(sessions).order_by(sessions.c.id))
+            return [SessionRow(r.id, r.name, r.model_id, r.dimension) for r in rows]
+
+    async def next_submap_index(self, agent: AgentRow) -> int:
+        """One more than the agent's last sub-map."""
+        async with self._database.read() as connection:
+            last = sa.select(sa.func.max(submaps.c.number)).where(submaps.c.agent_id == agent.id)
+            found = await connection.scalar(last)
+        return 0 if found is None else found + 1
+
+    async def session_page(
+        self, *, after: int = 0, limit: int = 100, session: str | None = None
+    ) -> tuple[list[records.SessionInfo], int | None]:
+        """Sessions behind row id `after`, or the one of a name, and where the next page begins."""
+        query = sa.select(
+            sessions,
+            _count(agents.c.session_id).label("agent_count"),
+            _count(submaps.c.session_id).label("submap_count"),
+            _sum_of_bytes(submaps.c.session_id == sessions.c.id).label("stored_bytes"),
+            sa.select(snapshots.c.revision)
+            .where(snapshots.c.session_id == sessions.c.id)
+            .scalar_subquery()
+            .label("revision"),
+            sa.select(sa.func.count())
+            .where(loops.c.session_id == sessions.c.id, loops.c.verdict == "PENDING")
+            .scalar_subquery()
+            .label("pending_loops"),
+        ).where(sessions.c.id > after)
+        if session is not None:
+            query = query.where(sessions.c.name == session)
+        rows, following = await self._page(query.order_by(sessions.c.id), limit)
+        return [_session_info(row) for row in rows], following
+
+    async def agent_page(
+        self, session: SessionRow, *, after: int = 0, limit: int = 100, agent: str | None = None
+    ) -> tuple[list[records.AgentInfo], int | None]:
+        """Agents behind row id `after`, or the one of a name, and where the next page begins."""
+        mine = submaps.c.agent_id == agents.c.id
+        query = sa.select(
+            agents,
+            sa.select(sa.func.count()).where(mine).scalar_subquery().label("submap_count"),
+            sa.select(sa.func.max(submaps.c.number)).where(mine).scalar_subquery().label("last"),
+        ).where(agents.c.session_id == session.id, agents.c.id > after)
+        if agent is not None:
+            query = query.where(agents.c.name == agent)
+        rows, following = await self._page(query.order_by(agents.c.id), limit)
+        return [_agent_info(session.name, row) for row in rows], following
+
+    async def _page(self, query: sa.Select, limit: int) -> tuple[Sequence[sa.Row], int | None]:
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query.limit(limit + 1))).all()
+        following = rows[limit - 1].id if len(rows) > limit else None
+        return rows[:limit], following
+
+
+async def _pinned_session(
+    connection: AsyncConnection, session: str, *, model_id: str, dimension: int, now: float
+) -> SessionRow:
+    """The session, begun with this encoder where it is new."""
+    found = await _find_session(connection, session)
+    if found is None:
+        values = {"name": session, "created_at": now, "model_id": model_id, "dimension": dimension}
+        added = await connection.execute(sa.insert(sessions), values)
+        return SessionRow(_new_id(added), session, model_id, dimension)
+    require_model(found, model_id, dimension)
+    return found
+
+
+def require_model(session: SessionRow, model_id: str, dimension: int) -> None:
+    """Raise DescriptorModelMismatch, naming both, unless the session has this encoder."""
+    if (session.model_id, session.dimension) != (model_id, dimension):
+        raise DescriptorModelMismatch(
+            f"{names.session_name(session.name)} is pinned to descriptors of {session.model_id!r} "
+            f"({session.dimension} numbers), the agent's are of {model_id!r} ({dimension} "
+            "numbers); start the agent with the session's model or begin another session"
+        )
+
+
+async def _find_session(connection: AsyncConnection, session: str) -> SessionRow | None:
+    row = (
+        await connection.execute(sa.select(sessions).where(sessions.c.name == session))
+    ).one_or_none()
+    return None if row is None else SessionRow(row.id, row.name, row.model_id, row.dimension)
+
+
+async def _find_agent(
+    connection: AsyncConnection, session: SessionRow, agent: str
+) -> AgentRow | None:
+    query = sa.select(agents).where(agents.c.session_id == session.id, agents.c.name == agent)
+    row = (await connection.execute(query)).one_or_none()
+    return None if row is None else AgentRow(row.id, session, row.name, row.finished)
+
+
+async def _touch(connection: AsyncConnection, agent_id: int, now: float) -> None:
+    change = sa.update(agents).where(agents.c.id == agent_id)
+    await connection.execute(change.values(last_seen_at=now))
+
+
+def _count(column: sa.Column) -> sa.ScalarSelect:
+    return sa.select(sa.func.count()).where(column == sessions.c.id).scalar_subquery()
+
+
+def _sum_of_bytes(condition: sa.ColumnElement[bool]) -> sa.ScalarSelect:
+    total = sa.func.coalesce(sa.func.sum(submaps.c.stored_bytes), 0)
+    return sa.select(total).where(condition).scalar_subquery()
+
+
+def _new_id(result: sa.CursorResult) -> int:
+    key = result.inserted_primary_key
+    assert key is not None  # every table here has an integer primary key
+    return int(key[0])
+
+
+def _session_info(row: sa.Row) -> records.SessionInfo:
+    return records.SessionInfo(
+        name=names.session_name(row.name),
+        created_at=moment(row.created_at),
+        descriptor_model_id=row.model_id,
+        descriptor_dimension=row.dimension,
+        agent_count=row.agent_count,
+        submap_count=row.submap_count,
+        stored_bytes=row.stored_bytes,
+        revision=row.revision or 0,
+        pending_loops=row.pending_loops,
+    )
+
+
+def _agent_info(session: str, row: sa.Row) -> records.AgentInfo:
+    return records.AgentInfo(
+        name=names.agent_name(session, row.name),
+        state="FINISHED" if row.finished else "ACTIVE",
+        registered_at=moment(row.registered_at),
+        last_seen_at=moment(row.last_seen_at),
+        submap_count=row.submap_count,
+        next_submap_index=0 if row.last is None else row.last + 1,
+    )

@@ -1,0 +1,143 @@
+"""Loop candidates and pose graph solutions in the store."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import sqlalchemy as sa
+
+from magic_core.wire import names, records
+from magic_server.store.database import Database
+from magic_server.store.rows import SessionRow, pack, unpack
+from magic_server.store.schema import agents, loops, snapshots, submaps
+
+
+class LoopTable:
+    """Loop candidates with their verdicts, and the newest solution of each session."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    async def add_candidates(
+        self, session: SessionRow, submap: str, candidates: Sequence[records.LoopCandidate]
+    ) -> None:
+        """Record the candidates of a sub-map, and that they were looked for."""
+        _, agent, index = names.parse_submap(submap)
+        mine = sa.select(agents.c.id).where(
+            agents.c.session_id == session.id, agents.c.name == agent
+        )
+        searched = sa.update(submaps).where(
+            submaps.c.agent_id == mine.scalar_subquery(), submaps.c.number == index
+        )
+        async with self._database.write() as connection:
+            await connection.execute(searched.values(searched=True))
+            if candidates:
+                rows = [_columns(loop) | {"session_id": session.id} for loop in candidates]
+                await connection.execute(sa.insert(loops), rows)
+
+    async def settle(self, session: SessionRow, loop: records.LoopCandidate) -> None:
+        """Store what verification found about a candidate."""
+        async with self._database.write() as connection:
+            change = sa.update(loops).where(
+                loops.c.session_id == session.id,
+                loops.c.source == loop.source,
+                loops.c.target == loop.target,
+            )
+            await connection.execute(change.values(_columns(loop)))
+
+    async def all(self, session: SessionRow) -> list[records.LoopCandidate]:
+        """Every candidate of a session, oldest first."""
+        found, _ = await self.page(session, limit=None)
+        return found
+
+    async def page(
+        self, session: SessionRow, *, after: int = 0, limit: int | None = 500
+    ) -> tuple[list[records.LoopCandidate], int | None]:
+        """Candidates behind row id `after`, and where the next page begins."""
+        query = sa.select(loops).where(loops.c.session_id == session.id, loops.c.id > after)
+        query = query.order_by(loops.c.id)
+        if limit is not None:
+            query = query.limit(limit + 1)
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query)).all()
+        following = rows[limit - 1].id if limit is not None and len(rows) > limit else None
+        return [_record(row) for row in rows[:limit]], following
+
+    async def of_submap(self, session: SessionRow, submap: str) -> list[records.LoopCandidate]:
+        """The candidates that a sub-map is part of, most similar first."""
+        query = sa.select(loops).where(
+            loops.c.session_id == session.id,
+            sa.or_(loops.c.source == submap, loops.c.target == submap),
+        )
+        query = query.order_by(loops.c.similarity.desc(), loops.c.id)
+        async with self._database.read() as connection:
+            return [_record(row) for row in await connection.execute(query)]
+
+    async def save_solution(
+        self,
+        session: SessionRow,
+        *,
+        revision: int,
+        snapshot: bytes,
+        kept: Collection[tuple[str, str]],
+    ) -> None:
+        """Replace the session's solution; `kept` holds the (source, target) it relies on."""
+        row = {"session_id": session.id, "revision": revision, "snapshot": snapshot}
+        mine = loops.c.session_id == session.id
+        async with self._database.write() as connection:
+            await connection.execute(
+                sa.delete(snapshots).where(snapshots.c.session_id == session.id)
+            )
+            await connection.execute(sa.insert(snapshots), row)
+            rows = await connection.execute(
+                sa.select(loops.c.id, loops.c.source, loops.c.target, loops.c.kept).where(
+                    mine, loops.c.verdict == "ACCEPTED"
+                )
+            )
+            for loop in rows.all():
+                wanted = (loop.source, loop.target) in kept
+                if wanted != loop.kept:
+                    change = sa.update(loops).where(loops.c.id == loop.id).values(kept=wanted)
+                    await connection.execute(change)
+
+    async def solution(self, session: SessionRow) -> bytes | None:
+        """The newest solution as a serialised PoseSnapshot, or None before the first."""
+        query = sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == session.id)
+        async with self._database.read() as connection:
+            return await connection.scalar(query)
+
+
+def _columns(loop: records.LoopCandidate) -> dict[str, object]:
+    return {
+        "source": loop.source,
+        "target": loop.target,
+        "similarity": loop.similarity,
+        "verdict": loop.verdict,
+        "reason": loop.reason,
+        "target_from_source": pack(loop.target_from_source),
+        "information": pack(loop.information),
+        "fitness": loop.fitness,
+        "rmse_m": loop.rmse_m,
+        "inliers": loop.inliers,
+        "overlap": loop.overlap,
+        "verify_seconds": loop.verify_seconds,
+        "kept": loop.kept,
+    }
+
+
+def _record(row: sa.Row) -> records.LoopCandidate:
+    return records.LoopCandidate(
+        source=row.source,
+        target=row.target,
+        similarity=row.similarity,
+        verdict=row.verdict,
+        reason=row.reason,
+        target_from_source=unpack(row.target_from_source, 4),
+        information=unpack(row.information, 6),
+        fitness=row.fitness,
+        rmse_m=row.rmse_m,
+        inliers=row.inliers,
+        overlap=row.overlap,
+        verify_seconds=row.verify_seconds,
+        kept=row.kept,
+    )

@@ -1,0 +1,95 @@
+"""What the store keeps that no message shows, and small conversions of column values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from magicslam.v1 import submap_pb2
+from numpy.typing import ArrayLike, NDArray
+
+from magic_core.submap import Descriptor, OdometryEdge
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRow:
+    """A session as the coordinator needs it."""
+
+    id: int
+    name: str
+    model_id: str
+    dimension: int
+
+
+@dataclass(frozen=True, slots=True)
+class AgentRow:
+    """An agent as the servicers need it."""
+
+    id: int
+    session: SessionRow
+    name: str
+    finished: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Vertex:
+    """A sub-map as the descriptor index and the pose graph need it."""
+
+    name: str
+    agent: str
+    """Resource name of its agent."""
+    index: int
+    descriptor: Descriptor
+    odometry: OdometryEdge | None
+    prior: NDArray[np.float64] | None  # world_from_anchor (4, 4)
+    searched: bool
+    """Whether loop candidates were looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewSubmap:
+    """A sub-map whose blobs are in place, ready for its transaction."""
+
+    header: submap_pb2.SubmapHeader
+    header_sha256: bytes
+    gaussian_count: int
+    digests: tuple[str, ...]
+    """SHA-256 in hex of each blob, in the header's order."""
+    vertex: Vertex
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSubmap:
+    """A stored sub-map's header and where its blobs are."""
+
+    header: bytes
+    """magicslam.v1.SubmapHeader, serialised: what is cheap to hand to another process."""
+    blobs: tuple[Path, ...]
+    """In the header's order."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapFile:
+    """One file of a global map."""
+
+    sha256: str
+    length: int
+
+
+def moment(seconds: float) -> datetime:
+    """Seconds since 1970 as UTC time."""
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def pack(array: ArrayLike | None) -> bytes | None:
+    """An array as little-endian float64 bytes."""
+    return None if array is None else np.ascontiguousarray(array, "<f8").tobytes()
+
+
+def unpack(data: bytes | None, side: int) -> NDArray[np.float64] | None:
+    """The (side, side) matrix of its bytes."""
+    if data is None:
+        return None
+    return np.frombuffer(data, "<f8").astype(np.float64).reshape(side, side)

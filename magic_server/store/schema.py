@@ -1,0 +1,137 @@
+"""Tables of the store. Names of columns are the facts; everything binary is little-endian."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+SCHEMA_VERSION = 1
+
+metadata = sa.MetaData()
+
+schema_version = sa.Table("schema_version", metadata, sa.Column("version", sa.Integer))
+
+sessions = sa.Table(
+    "sessions",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("name", sa.String(63), nullable=False, unique=True),
+    sa.Column("created_at", sa.Float, nullable=False),  # seconds since 1970, UTC
+    sa.Column("model_id", sa.String(128), nullable=False),
+    sa.Column("dimension", sa.Integer, nullable=False),
+)
+
+agents = sa.Table(
+    "agents",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
+    sa.Column("name", sa.String(63), nullable=False),
+    sa.Column("finished", sa.Boolean, nullable=False),
+    sa.Column("registered_at", sa.Float, nullable=False),
+    sa.Column("last_seen_at", sa.Float, nullable=False),
+    sa.UniqueConstraint("session_id", "name"),
+)
+
+submaps = sa.Table(
+    "submaps",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),  # grows with the order of arrival
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("agent_id", sa.ForeignKey("agents.id"), nullable=False),
+    sa.Column("number", sa.Integer, nullable=False),  # index within the agent
+    sa.Column("request_id", sa.String(128), nullable=False),
+    sa.Column("header_sha256", sa.LargeBinary(32), nullable=False),
+    sa.Column("header", sa.LargeBinary, nullable=False),  # magicslam.v1.SubmapHeader
+    sa.Column("received_at", sa.Float, nullable=False),
+    sa.Column("first_timestamp_s", sa.Float, nullable=False),
+    sa.Column("last_timestamp_s", sa.Float, nullable=False),
+    sa.Column("frame_count", sa.Integer, nullable=False),
+    sa.Column("keyframe_count", sa.Integer, nullable=False),
+    sa.Column("gaussian_count", sa.Integer, nullable=False),
+    sa.Column("stored_bytes", sa.Integer, nullable=False),
+    # What the index and the pose graph need, so that a restart parses no header.
+    sa.Column("descriptor", sa.LargeBinary, nullable=False),  # float32 (d,)
+    sa.Column("previous_number", sa.Integer),
+    sa.Column("previous_from_anchor", sa.LargeBinary),  # float64 (4, 4)
+    sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
+    sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
+    sa.Column("searched", sa.Boolean, nullable=False),  # loop candidates were looked for
+    sa.UniqueConstraint("agent_id", "number"),
+)
+
+submap_blobs = sa.Table(
+    "submap_blobs",
+    metadata,
+    sa.Column("submap_id", sa.ForeignKey("submaps.id"), primary_key=True),
+    sa.Column("position", sa.Integer, primary_key=True),  # index in the header
+    sa.Column("sha256", sa.String(64), nullable=False, index=True),
+)
+
+loops = sa.Table(
+    "loops",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("source", sa.String, nullable=False),  # resource names
+    sa.Column("target", sa.String, nullable=False),
+    sa.Column("similarity", sa.Float, nullable=False),
+    sa.Column("verdict", sa.String(16), nullable=False),
+    sa.Column("reason", sa.String(64), nullable=False),
+    sa.Column("target_from_source", sa.LargeBinary),  # float64 (4, 4)
+    sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
+    sa.Column("fitness", sa.Float, nullable=False, default=0.0),
+    sa.Column("rmse_m", sa.Float, nullable=False, default=0.0),
+    sa.Column("inliers", sa.Integer, nullable=False, default=0),
+    sa.Column("overlap", sa.Float, nullable=False, default=0.0),
+    sa.Column("verify_seconds", sa.Float, nullable=False, default=0.0),
+    sa.Column("kept", sa.Boolean, nullable=False, default=False),
+    sa.UniqueConstraint("session_id", "source", "target"),
+)
+
+snapshots = sa.Table(
+    "snapshots",
+    metadata,
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
+    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("snapshot", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
+)
+
+operations = sa.Table(
+    "operations",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
+    sa.Column("request_id", sa.String(128), nullable=False),
+    sa.Column("request", sa.LargeBinary, nullable=False),  # magicslam.v1.BuildGlobalMapRequest
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("progress", sa.Float, nullable=False),
+    sa.Column("stage", sa.String, nullable=False),
+    sa.Column("created_at", sa.Float, nullable=False),
+    sa.Column("updated_at", sa.Float, nullable=False),
+    sa.Column("error_code", sa.String(32)),
+    sa.Column("error_reason", sa.String(64)),
+    sa.Column("error_message", sa.String),
+    sa.Column("map_id", sa.ForeignKey("maps.id")),
+    sa.UniqueConstraint("session_id", "request_id"),
+)
+
+maps = sa.Table(
+    "maps",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("component", sa.String, nullable=False),
+    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("submaps", sa.JSON, nullable=False),  # resource names
+    sa.Column("gaussian_count", sa.Integer, nullable=False),
+    sa.Column("created_at", sa.Float, nullable=False),
+)
+
+map_files = sa.Table(
+    "map_files",
+    metadata,
+    sa.Column("map_id", sa.ForeignKey("maps.id"), primary_key=True),
+    sa.Column("format", sa.String(16), primary_key=True),  # ply, lossless, compact
+    sa.Column("sha256", sa.String(64), nullable=False, index=True),
+    sa.Column("length", sa.Integer, nullable=False),
+)

@@ -1,0 +1,138 @@
+"""The store of one server: a database and a blob folder, consistent at every instant.
+
+Blobs are written, synced and moved to their places first; one transaction then refers to them. A
+server that dies in between leaves blobs that nothing refers to, which the next start removes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import logging
+import os
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Self
+
+import sqlalchemy as sa
+
+from magic_core.errors import WrongState
+from magic_server.store.agents import AgentTable
+from magic_server.store.blobs import BlobFolder, BlobWriter
+from magic_server.store.database import Database
+from magic_server.store.loops import LoopTable
+from magic_server.store.maps import MapTable, NewMap
+from magic_server.store.rows import AgentRow, NewSubmap, SessionRow
+from magic_server.store.schema import map_files, submap_blobs
+from magic_server.store.submaps import FirstAnswer, SubmapTable
+
+logger = logging.getLogger(__name__)
+
+
+class Store:
+    """Everything a server remembers, under one folder."""
+
+    def __init__(self, folder: Path, threads: Executor) -> None:
+        self.folder = folder
+        self.blobs = BlobFolder(folder)
+        self._threads = threads
+        self._database = Database(folder / "magic.sqlite")
+        self._commit_lock = asyncio.Lock()
+        self._lock_file: int | None = None
+        self.agents = AgentTable(self._database)
+        self.submaps = SubmapTable(self._database, self.blobs)
+        self.loops = LoopTable(self._database)
+        self.maps = MapTable(self._database)
+
+    async def __aenter__(self) -> Self:
+        await self.open()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def open(self) -> None:
+        """Lock the folder, create what is missing and drop what a dead server left half done.
+
+        Raises WrongState when another server has the folder.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock_file = _locked(self.folder)
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._threads, self.blobs.open)
+        await self._database.open()
+        removed = await self.collect_orphans()
+        if removed:
+            logger.info("removed %d blobs that nothing referred to", removed)
+
+    async def close(self) -> None:
+        """Close the database and give the folder free."""
+        await self._database.close()
+        if self._lock_file is not None:
+            os.close(self._lock_file)
+            self._lock_file = None
+
+    async def add_submap(
+        self, agent: AgentRow, submap: NewSubmap, written: Sequence[BlobWriter], *, now: float
+    ) -> FirstAnswer | None:
+        """Make a received sub-map durable: its blobs, then one transaction.
+
+        Returns what was answered before when another request stored the same sub-map meanwhile.
+        Nothing is left behind when it fails.
+        """
+        loop = asyncio.get_running_loop()
+        async with self._commit_lock:  # nobody else may come to rely on blobs that are taken back
+            first = await self.submaps.first_answer(agent, submap.vertex.index)
+            if first is not None:
+                return first
+            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            try:
+                await self.submaps.insert(agent, submap, now=now)
+            except BaseException:
+                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                raise
+        return None
+
+    async def add_map(
+        self,
+        operation: int,
+        session: SessionRow,
+        made: NewMap,
+        *,
+        written: Sequence[BlobWriter],
+        now: float,
+    ) -> None:
+        """Make a merged map durable and its operation done."""
+        loop = asyncio.get_running_loop()
+        async with self._commit_lock:
+            await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            await self.maps.succeed(operation, session, made, now=now)
+
+    async def collect_orphans(self) -> int:
+        """Remove blobs that no sub-map and no map refers to; returns how many."""
+        loop = asyncio.get_running_loop()
+        async with self._commit_lock:
+            async with self._database.read() as connection:
+                used = set(await connection.scalars(sa.select(submap_blobs.c.sha256).distinct()))
+                used |= set(await connection.scalars(sa.select(map_files.c.sha256).distinct()))
+
+            def remove() -> int:
+                orphans = [name for name in self.blobs.names() if name not in used]
+                self.blobs.remove(orphans)
+                return len(orphans)
+
+            return await loop.run_in_executor(self._threads, remove)
+
+
+def _locked(folder: Path) -> int:
+    """An open file that holds the folder's lock for as long as this process lives."""
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise WrongState(
+            f"{folder} is in use by another server; stop it or choose another data folder"
+        ) from None
+    return descriptor

@@ -1,0 +1,206 @@
+"""Sub-maps in the store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sqlalchemy as sa
+from magicslam.v1 import submap_pb2
+
+from magic_core.errors import NotFound
+from magic_core.submap import Descriptor, OdometryEdge
+from magic_core.wire import names, records
+from magic_server.store.blobs import BlobFolder
+from magic_server.store.database import Database
+from magic_server.store.rows import (
+    AgentRow,
+    NewSubmap,
+    SessionRow,
+    StoredSubmap,
+    Vertex,
+    moment,
+    pack,
+    unpack,
+)
+from magic_server.store.schema import agents, submap_blobs, submaps
+
+_SUMMARY = (
+    submaps.c.id,
+    submaps.c.number,
+    submaps.c.received_at,
+    submaps.c.first_timestamp_s,
+    submaps.c.last_timestamp_s,
+    submaps.c.frame_count,
+    submaps.c.keyframe_count,
+    submaps.c.gaussian_count,
+    submaps.c.stored_bytes,
+    agents.c.name.label("agent"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class FirstAnswer:
+    """What was answered to a sub-map that is stored already."""
+
+    request_id: str
+    header_sha256: bytes
+    received_at: float
+    stored_bytes: int
+
+
+class SubmapTable:
+    """Sub-maps, their headers and which blobs they hold."""
+
+    def __init__(self, database: Database, blobs: BlobFolder) -> None:
+        self._database = database
+        self._blobs = blobs
+
+    async def insert(self, agent: AgentRow, submap: NewSubmap, *, now: float) -> None:
+        """The one transaction that makes a sub-map part of its session."""
+        async with self._database.write() as connection:
+            values = _columns(agent, submap) | {"received_at": now}
+            added = await connection.execute(sa.insert(submaps), values)
+            key = added.inserted_primary_key
+            assert key is not None  # the table has an integer primary key
+            rows = [
+                {"submap_id": key[0], "position": position, "sha256": digest}
+                for position, digest in enumerate(submap.digests)
+            ]
+            await connection.execute(sa.insert(submap_blobs), rows)
+            seen = sa.update(agents).where(agents.c.id == agent.id).values(last_seen_at=now)
+            await connection.execute(seen)
+
+    async def first_answer(self, agent: AgentRow, index: int) -> FirstAnswer | None:
+        """The answer that a stored sub-map got, or None."""
+        query = sa.select(
+            submaps.c.request_id,
+            submaps.c.header_sha256,
+            submaps.c.received_at,
+            submaps.c.stored_bytes,
+        ).where(submaps.c.agent_id == agent.id, submaps.c.number == index)
+        async with self._database.read() as connection:
+            row = (await connection.execute(query)).one_or_none()
+        return None if row is None else FirstAnswer(*row)
+
+    async def stored(self, session: SessionRow, agent: str, index: int) -> StoredSubmap:
+        """A sub-map's header and blob paths; NotFound when it is not stored."""
+        name = names.submap_name(session.name, agent, index)
+        query = sa.select(submaps.c.id, submaps.c.header).join(agents)
+        query = query.where(_is(session, agent, index))
+        async with self._database.read() as connection:
+            row = (await connection.execute(query)).one_or_none()
+            if row is None:
+                raise NotFound(f"{name} is not stored")
+            digests = sa.select(submap_blobs.c.sha256).where(submap_blobs.c.submap_id == row.id)
+            found = await connection.scalars(digests.order_by(submap_blobs.c.position))
+            paths = tuple(self._blobs.path(sha256) for sha256 in found)
+        return StoredSubmap(row.header, paths)
+
+    async def vertices(self, session: SessionRow) -> list[Vertex]:
+        """Every sub-map of a session as the pose graph needs it, in order of arrival."""
+        columns = [c for c in submaps.c if c.name != "header"]
+        query = sa.select(*columns, agents.c.name.label("agent")).join(agents)
+        query = query.where(submaps.c.session_id == session.id).order_by(submaps.c.id)
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query)).all()
+        return [_vertex(session, row) for row in rows]
+
+    async def headers(
+        self, session: SessionRow, agent: str
+    ) -> list[tuple[str, submap_pb2.SubmapHeader]]:
+        """(name, header) of every sub-map of an agent by index."""
+        query = sa.select(submaps.c.number, submaps.c.header).join(agents)
+        query = query.where(submaps.c.session_id == session.id, agents.c.name == agent)
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query.order_by(submaps.c.number))).all()
+        return [
+            (
+                names.submap_name(session.name, agent, row.number),
+                submap_pb2.SubmapHeader.FromString(row.header),
+            )
+            for row in rows
+        ]
+
+    async def page(
+        self, session: SessionRow, *, agent: str | None = None, after: int = 0, limit: int = 100
+    ) -> tuple[list[records.SubmapInfo], int | None]:
+        """Sub-maps behind row id `after` in order of arrival, and where the next page begins."""
+        query = sa.select(*_SUMMARY).join(agents)
+        query = query.where(submaps.c.session_id == session.id, submaps.c.id > after)
+        if agent is not None:
+            query = query.where(agents.c.name == agent)
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query.order_by(submaps.c.id).limit(limit + 1))).all()
+        following = rows[limit - 1].id if len(rows) > limit else None
+        return [_info(session, row) for row in rows[:limit]], following
+
+    async def info(self, session: SessionRow, agent: str, index: int) -> records.SubmapInfo:
+        """Summary of one sub-map; NotFound when it is not stored."""
+        query = sa.select(*_SUMMARY).join(agents).where(_is(session, agent, index))
+        async with self._database.read() as connection:
+            row = (await connection.execute(query)).one_or_none()
+        if row is None:
+            raise NotFound(f"{names.submap_name(session.name, agent, index)} is not stored")
+        return _info(session, row)
+
+
+def _is(session: SessionRow, agent: str, index: int) -> sa.ColumnElement[bool]:
+    return sa.and_(
+        submaps.c.session_id == session.id, agents.c.name == agent, submaps.c.number == index
+    )
+
+
+def _columns(agent: AgentRow, submap: NewSubmap) -> dict[str, object]:
+    header, vertex = submap.header, submap.vertex
+    edge = vertex.odometry
+    return {
+        "session_id": agent.session.id,
+        "agent_id": agent.id,
+        "number": vertex.index,
+        "request_id": header.request_id,
+        "header_sha256": submap.header_sha256,
+        "header": header.SerializeToString(),
+        "first_timestamp_s": header.trajectory[0].timestamp_s,
+        "last_timestamp_s": header.trajectory[-1].timestamp_s,
+        "frame_count": len(header.trajectory),
+        "keyframe_count": len(header.keyframes),
+        "gaussian_count": submap.gaussian_count,
+        "stored_bytes": sum(blob.length for blob in header.blobs),
+        "descriptor": vertex.descriptor.vector.astype("<f4").tobytes(),
+        "previous_number": None if edge is None else edge.previous_index,
+        "previous_from_anchor": None if edge is None else pack(edge.previous_from_anchor),
+        "information": None if edge is None else pack(edge.information),
+        "prior": pack(vertex.prior),
+        "searched": False,
+    }
+
+
+def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
+    odometry = None
+    motion, information = unpack(row.previous_from_anchor, 4), unpack(row.information, 6)
+    if motion is not None and information is not None:
+        odometry = OdometryEdge(row.previous_number, motion, information)
+    vector = np.frombuffer(row.descriptor, "<f4").astype(np.float32)
+    return Vertex(
+        name=names.submap_name(session.name, row.agent, row.number),
+        agent=names.agent_name(session.name, row.agent),
+        index=row.number,
+        descriptor=Descriptor(session.model_id, vector),
+        odometry=odometry,
+        prior=unpack(row.prior, 4),
+        searched=row.searched,
+    )
+
+
+def _info(session: SessionRow, row: sa.Row) -> records.SubmapInfo:
+    return records.SubmapInfo(
+        name=names.submap_name(session.name, row.agent, row.number),
+        received_at=moment(row.received_at),
+        first_timestamp_s=row.first_timestamp_s,
+        last_timestamp_s=row.last_timestamp_s,
+        frame_count=row.frame_count,
+        keyframe_count=row.keyframe_count,
+        gaussian_count=row.gaussian_count,
+        stored_bytes=row.stored_bytes,
+    )
