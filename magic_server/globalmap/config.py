@@ -25,8 +25,9 @@ class MergeConfig:
     """Rendered alpha below which a pixel counts as not shown."""
     prune_opacity: float = 0.05
     """Gaussians below this opacity are removed."""
-    duplicate_share: float = 0.35
-    """Gaussians nearer to a larger neighbour than this share of their size are its duplicates."""
+    min_contribution: float = 0.3
+    """Gaussians whose blending weights sum to less, in pixels, in every keyframe are removed:
+    duplicates where sub-maps overlap, and what is hidden. 0 keeps them."""
     max_gaussians: int = 2_000_000
     """Bound of the merged map; nothing is seeded beyond it."""
     ssim_weight: float = 0.2

@@ -95,7 +95,8 @@ def _nearest_pixel(solid: NDArray[np.bool_]) -> NDArray[np.int64]:
     _, labels = cv2.distanceTransformWithLabels(
         (~solid).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    index_of_label = np.zeros(labels.max() + 1, np.int64)
+    labels = np.asarray(labels, dtype=np.int64)
+    index_of_label = np.zeros(int(labels.max()) + 1, np.int64)
     index_of_label[labels[solid]] = np.flatnonzero(solid)
     return index_of_label[labels.reshape(-1)]
 

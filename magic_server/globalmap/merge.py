@@ -14,8 +14,9 @@ import numpy as np
 
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud
-from magic_core.render import GaussianOptimiser, LossWeights
+from magic_core.render import GaussianOptimiser, LossWeights, Rasteriser
 from magic_server.globalmap.config import MergeConfig
+from magic_server.globalmap.contribution import best_contribution
 from magic_server.globalmap.fill import fill_measured, fill_unmeasured
 from magic_server.globalmap.placement import PlacedSubmap, View, coarse_merge, views_of
 from magic_server.globalmap.quality import mean_psnr
@@ -82,8 +83,10 @@ class _Merge:
         filled = pruned = iterations = 0
         converged = False
         if self._config.refine:
+            pruned += self._prune_hidden(optimiser, 0.01)
             filled = self._fill(optimiser)
-            iterations, pruned, converged = self._refine(optimiser)
+            iterations, faded, converged = self._refine(optimiser)
+            pruned += faded + self._prune_hidden(optimiser, 0.98)
         cloud = optimiser.gaussians()
         fine_psnr = mean_psnr(optimiser, self._judged)
         self._progress(1.0, f"merged {len(cloud)} Gaussians")
@@ -151,6 +154,18 @@ class _Merge:
 
     def _prune(self, optimiser: GaussianOptimiser) -> int:
         keep = optimiser.gaussians().opacities >= self._config.prune_opacity
+        if not keep.all():
+            optimiser.prune(keep)
+        return int((~keep).sum())
+
+    def _prune_hidden(self, optimiser: GaussianOptimiser, share: float) -> int:
+        """Remove what no keyframe shows: duplicates of overlapping sub-maps, hidden leftovers."""
+        if self._config.min_contribution <= 0.0 or not self._views:
+            return 0
+        self._progress(share, "removing what no keyframe shows")
+        rasteriser = Rasteriser(self._config.threads or None)
+        shown = best_contribution(optimiser.gaussians(), self._views, rasteriser=rasteriser)
+        keep = shown >= self._config.min_contribution
         if not keep.all():
             optimiser.prune(keep)
         return int((~keep).sum())

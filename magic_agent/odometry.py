@@ -1,0 +1,66 @@
+"""The sub-map under construction: its trajectory, and the odometry edge that leads out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_agent.slam_config import SubmapConfig
+from magic_core.data import Frame
+from magic_core.geometry import se3
+from magic_core.submap import Descriptor, OdometryEdge, TrackedFrame
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class ActiveSubmap:
+    """What an agent knows of the sub-map it is building, besides Gaussians and keyframes."""
+
+    index: int
+    odometry: OdometryEdge | None
+    descriptor: Descriptor
+    prior: Pose | None
+    trajectory: list[TrackedFrame] = field(default_factory=list)
+
+    @property
+    def last_pose(self) -> Pose:
+        """anchor_from_camera of the last frame."""
+        return self.trajectory[-1].anchor_from_camera
+
+    def append(self, frame: Frame, anchor_from_camera: Pose, *, lost: bool) -> None:
+        """Note one frame's pose."""
+        self.trajectory.append(
+            TrackedFrame(frame.index, frame.timestamp_s, anchor_from_camera, lost)
+        )
+
+    def is_due(self, anchor_from_camera: Pose, config: SubmapConfig) -> bool:
+        """Whether a frame at this pose should open the next sub-map (count, distance or turn)."""
+        count = len(self.trajectory)
+        far = float(np.linalg.norm(anchor_from_camera[:3, 3])) > config.translation_m
+        turned = np.rad2deg(se3.rotation_angle(anchor_from_camera)) > config.rotation_deg
+        return count >= config.frames or (count >= config.min_frames and (far or bool(turned)))
+
+
+def hand_over_edge(
+    index: int, anchor_from_next: Pose, information: NDArray[np.float64], config: SubmapConfig
+) -> OdometryEdge:
+    """The odometry edge out of sub-map `index`.
+
+    Its covariance is the tracker's for the last pose, plus the drift of the model itself: frames
+    are tracked against the sub-map, whose far end was built from near, so the error grows with the
+    sub-map and not with the frame count. `information` is that of the tracker, (6, 6).
+    """
+    drift = np.concatenate(
+        [
+            np.full(3, config.drift_translation_m**2),
+            np.full(3, np.deg2rad(config.drift_rotation_deg) ** 2),
+        ]
+    )
+    # The eigenvalues are bounded below so that an undetermined direction stays a large variance.
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    covariance = (vectors / np.maximum(values, 1.0)) @ vectors.T + np.diag(drift)
+    inverse = np.linalg.inv(covariance)
+    return OdometryEdge(index, anchor_from_next, 0.5 * (inverse + inverse.T))
