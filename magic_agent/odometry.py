@@ -40,8 +40,8 @@ class ActiveSubmap:
         """Whether a frame at this pose should open the next sub-map (count, distance or turn)."""
         count = len(self.trajectory)
         far = float(np.linalg.norm(anchor_from_camera[:3, 3])) > config.translation_m
-        turned = np.rad2deg(se3.rotation_angle(anchor_from_camera)) > config.rotation_deg
-        return count >= config.frames or (count >= config.min_frames and (far or bool(turned)))
+        turned = float(np.rad2deg(se3.rotation_angle(anchor_from_camera))) > config.rotation_deg
+        return count >= config.frames or (count >= config.min_frames and (far or turned))
 
 
 def hand_over_edge(

@@ -19,7 +19,7 @@ def moved_enough(
     """Whether the camera moved or turned past the thresholds since the last keyframe."""
     last_from_camera = se3.inverse(anchor_from_last) @ anchor_from_camera
     shift = float(np.linalg.norm(last_from_camera[:3, 3]))
-    turn = np.rad2deg(se3.rotation_angle(last_from_camera))
+    turn = float(np.rad2deg(se3.rotation_angle(last_from_camera)))
     return shift > config.translation * median_depth or turn > config.rotation_deg
 
 
