@@ -89,6 +89,28 @@ class LostConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class RelocalisationConfig:
+    """How a lost frame is found again in the active sub-map."""
+
+    keypoints: int = 500
+    """SIFT keypoints per image."""
+    ratio: float = 0.85
+    """Nearest against second nearest descriptor distance of a match, at most."""
+    reprojection_px: float = 3.0
+    """Reprojection error of an inlier, at most."""
+    min_inliers: int = 15
+    """Keypoints that must support a pose."""
+    refined: int = 3
+    """Best hypotheses that are refined against the sub-map."""
+    min_inlier_share: float = 0.6
+    """Share of depths that must agree with the sub-map after refinement."""
+    max_correction_m: float = 0.15
+    """Refinement that moves farther than this went to another minimum."""
+    max_correction_deg: float = 8.0
+    """Refinement that turns farther than this went to another minimum."""
+
+
+@dataclass(frozen=True, slots=True)
 class TrackingConfig:
     """How each frame's pose is found."""
 
@@ -101,6 +123,7 @@ class TrackingConfig:
     gauss_newton: GaussNewtonConfig = field(default_factory=GaussNewtonConfig)
     adam: AdamConfig = field(default_factory=AdamConfig)
     lost: LostConfig = field(default_factory=LostConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
 
     def __post_init__(self) -> None:
         if self.solver == "gn":

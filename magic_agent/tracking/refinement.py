@@ -14,8 +14,9 @@ from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, MotionPrio
 from magic_agent.tracking.pyramid import Pyramid, view_pyramid
 from magic_agent.tracking.result import StageClock
 from magic_core.data import Frame
-from magic_core.geometry import se3
-from magic_core.render import RenderedView
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import Camera, se3
+from magic_core.render import Rasteriser, RenderedView
 
 Pose = NDArray[np.float64]
 ReferenceView = Callable[[Pose], RenderedView]
@@ -37,6 +38,22 @@ class DifferentiableView(Protocol):
 
 
 _FINE_LEVEL = 1  # after the first render only this level and finer ones are solved again
+
+
+class CloudView:
+    """A cloud of Gaussians as a reference view with gradients: the sub-map for the Adam solver."""
+
+    def __init__(self, cloud: GaussianCloud, camera: Camera, *, threads: int | None = None) -> None:
+        self._cloud, self._camera = cloud, camera
+        self._rasteriser = Rasteriser(threads)
+
+    def __call__(self, anchor_from_camera: Pose) -> RenderedView:
+        """Render the cloud, anchor frame."""
+        return self._rasteriser.render(self._cloud, self._camera, anchor_from_camera)
+
+    def backward(self, gradient: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(6,) gradient by the right perturbation of the last pose."""
+        return self._rasteriser.backward(gradient).pose
 
 
 @dataclass(frozen=True, slots=True)

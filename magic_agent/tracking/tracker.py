@@ -9,6 +9,7 @@ mapper. Poses are relative to the sub-map's anchor.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +24,13 @@ from magic_agent.tracking.refinement import (
     Refinement,
     Refiner,
 )
+from magic_agent.tracking.relocalisation import Relocaliser
 from magic_agent.tracking.result import StageClock, TrackingResult
 from magic_agent.tracking.rotation import align_rotation
 from magic_agent.tracking.verdict import judge
 from magic_core.data import Frame
 from magic_core.geometry import Camera, se3
+from magic_core.submap import Keyframe
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +47,8 @@ class Tracker:
         self._config = config or TrackingConfig()
         self._pyramids = PyramidCache(camera, self._config.gauss_newton.levels)
         self._initialiser = make_initialiser(self._config, self._pyramids)
-        self._refiner = _make_refiner(camera, self._config)
+        self._refiner = _make_refiner(self._config)
+        self._relocaliser: Relocaliser | None = None
 
     @property
     def config(self) -> TrackingConfig:
@@ -114,6 +118,18 @@ class Tracker:
             clock=clock,
         )
 
+    def relocalise(
+        self, frame: Frame, keyframes: Sequence[Keyframe], *, reference: ReferenceView
+    ) -> TrackingResult | None:
+        """Find a frame in the active sub-map from its keyframes alone; None if it is not there."""
+        if self._relocaliser is None:
+            self._relocaliser = Relocaliser(self._camera, self._config.relocalisation)
+        return self._relocaliser.relocalise(
+            frame.colour,
+            keyframes,
+            refine=lambda pose: self.refine(frame, anchor_from_camera=pose, reference=reference),
+        )
+
     def _start(self, frame: Frame, previous: Frame, predicted: Pose) -> Pose:
         """previous_from_current before refinement."""
         if self._config.rotation_prealignment:
@@ -172,7 +188,7 @@ class Tracker:
         )
 
 
-def _make_refiner(camera: Camera, config: TrackingConfig) -> Refiner:
+def _make_refiner(config: TrackingConfig) -> Refiner:
     if config.solver == "adam":
         from magic_agent.tracking.adam import AdamRefiner  # loads torch only when asked for
 

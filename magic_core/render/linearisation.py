@@ -36,6 +36,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from magic_core.geometry import Camera, se3
+from magic_core.render import threads as thread_pool
+from magic_core.render.simd import claim
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -47,6 +49,9 @@ _COLUMNS = _UNKNOWNS + 1  # the residual itself is the last column of the Jacobi
 # Sums behind the 9 x 9 Gram matrix: cost, then soft counts of the pixels that are visible in both
 # views, of those with two depths, and of those whose depths agree.
 _COST, _SUMS = _COLUMNS * _COLUMNS, 4
+
+_BLOCK_ROWS = 16
+_WORTH_SHARING = 10_000  # pixels; smaller images are done before a second thread wakes up
 
 # A row is worked through in spans. The fields of a span lie in one flat array at offsets known to
 # the compiler, which then needs no overlap checks and keeps all loops but one in vector registers.
@@ -129,6 +134,7 @@ def linearise(
     model: ResidualModel,
     gain: float = 1.0,
     bias: float = 0.0,
+    threads: int | None = None,
 ) -> NormalEquations:
     """Sum the normal equations of an RGB-D image against a reference view of the same camera.
 
@@ -140,9 +146,20 @@ def linearise(
         camera_from_reference: (4, 4) pose at which to linearise.
         model: noise, robust widths and masks.
         gain, bias: the photometric correction applied to the image.
+        threads: how many cores to use (default: `threads.default_threads()`); sums are the same
+            whatever their number, because each block of rows is summed on its own.
     """
-    arguments = (reference, image, *_packed(camera, camera_from_reference, gain, bias))
-    sums = _sum_rows(1, reference.shape[1] - 1, *arguments, _packed_model(model))
+    height, width = reference.shape[1:]
+    blocks = np.zeros((-(-(height - 2) // _BLOCK_ROWS), _COST + _SUMS))
+    packed = _packed(camera, camera_from_reference, gain, bias)
+    if threads is None:
+        threads = thread_pool.default_threads()
+    thread_pool.run(
+        _sum_blocks,
+        (reference, image, *packed, _packed_model(model), blocks),
+        threads=threads if height * width >= _WORTH_SHARING else 1,
+    )
+    sums = blocks.sum(axis=0)
     gram = sums[:_COST].reshape(_COLUMNS, _COLUMNS)
     gram = np.triu(gram) + np.triu(gram, 1).T
     return NormalEquations(
@@ -212,11 +229,25 @@ def _packed_model(model: ResidualModel) -> Float32:
 
 
 @njit(**_KERNEL)
-def _sum_rows(first, last, reference, image, intrinsics, pose, inverse, photometric, model):
-    """Sums of the rows [first, last): the Gram matrix (9 x 9, upper triangle), then `_SUMS`."""
+def _sum_blocks(claimed, reference, image, intrinsics, pose, inverse, photometric, model, blocks):
+    """Claim blocks of rows and sum each: the Gram matrix (9 x 9, upper triangle), then `_SUMS`."""
+    last_row = reference.shape[1] - 1
+    while True:
+        block = claim(claimed, np.int64(1))
+        if block >= len(blocks):
+            return
+        first = 1 + block * _BLOCK_ROWS
+        _sum_rows(
+            first, min(first + _BLOCK_ROWS, last_row),
+            reference, image, intrinsics, pose, inverse, photometric, model, blocks[block],
+        )  # fmt: skip
+
+
+@njit(**_KERNEL)
+def _sum_rows(first, last, reference, image, intrinsics, pose, inverse, photometric, model, sums):
+    """Add the rows [first, last) to `sums`."""
     inner = reference.shape[2] - 1
     work = np.zeros(_WORK, np.float32)
-    sums = np.zeros(_COST + _SUMS)
     for row in range(first, last):
         for start in range(1, inner, _SPAN):
             n = min(_SPAN, inner - start)
@@ -236,7 +267,6 @@ def _sum_rows(first, last, reference, image, intrinsics, pose, inverse, photomet
             _add_gram_block(3, 3, work, sums)
             _add_gram_block(3, 6, work, sums)
             _add_gram_block(6, 6, work, sums)
-    return sums
 
 
 @njit(**_KERNEL)
