@@ -9,15 +9,33 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from magic_core.render.optimiser import (
+        GaussianOptimiser,
+        LearningRates,
+        LossWeights,
+        StepReport,
+    )
     from magic_core.render.rasteriser import Gradients, Rasteriser, RenderedView
 
 _HOMES = {
+    "GaussianOptimiser": "optimiser",
+    "LearningRates": "optimiser",
+    "LossWeights": "optimiser",
+    "StepReport": "optimiser",
     "Gradients": "rasteriser",
     "Rasteriser": "rasteriser",
     "RenderedView": "rasteriser",
 }
 
-__all__ = ["Gradients", "Rasteriser", "RenderedView"]
+__all__ = [
+    "GaussianOptimiser",
+    "Gradients",
+    "LearningRates",
+    "LossWeights",
+    "Rasteriser",
+    "RenderedView",
+    "StepReport",
+]
 
 
 def __getattr__(name: str):

@@ -216,7 +216,9 @@ class Rasteriser:
             self._chunks = 0
         shape = (5, camera.height, camera.width)
         if getattr(self, "image", None) is None or self.image.shape != shape:
-            self.image = np.zeros(shape, np.float32)
+            pixels = 5 * camera.height * camera.width
+            self.image_with_margin = aligned_zeros(pixels + LANES)  # vectors may read past the end
+            self.image = self.image_with_margin[:pixels].reshape(shape)
             self._tiles_x, self._tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
             self._tiles = self._tiles_x * self._tiles_y
             self.corners = np.zeros((self._tiles_x + 1) * (self._tiles_y + 1), np.int32)

@@ -1,0 +1,196 @@
+"""The mapping losses and their gradient by the rendered image, one row of pixels at a time.
+
+With x the rendered and y the observed image, W a weight per pixel, N pixels, M of them with depth:
+
+    colour = (1 - l) sum W |x - y| / 3N + l sum W (1 - SSIM(x, y)) / 3N,
+    depth  = sum W |z - d| / M over the pixels with depth d (z is the accumulated depth).
+
+SSIM (Wang et al. 2004) with a Gaussian window of 11 pixels, sigma 1.5, zero padding, as in 3DGS.
+With E the windowed mean, mu = E x, and
+
+    S = A1 A2 / (B1 B2),  A1 = 2 mu_x mu_y + c1,  A2 = 2 (E xy - mu_x mu_y) + c2,
+    B1 = mu_x^2 + mu_y^2 + c1,  B2 = E xx - mu_x^2 + E yy - mu_y^2 + c2,
+
+the gradient is dS/dx = E' [dS/dmu_x] + 2 x E' [dS/dE xx] + y E' [dS/dE xy], with E' = E as the
+window is symmetric. So one pass writes three maps and the next one windows them: each first down
+the columns (lanes are neighbouring columns), then along the row in a buffer with zero margins.
+
+Every flat image array has room for LANES values past its end, which vectors may read.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magic_core.render.jit import inlined, kernel
+from magic_core.render.lanes import LANES
+from magic_core.render.layout import f32
+from magic_core.render.simd import claim, fma, fnma, load, splat, store
+
+RADIUS = 5
+_C1, _C2 = f32(0.01**2), f32(0.03**2)
+_ZERO, _ONE, _TWO = f32(0.0), f32(1.0), f32(2.0)
+
+# Sums of one row, float64: W |x - y|, W S, W |z - d|.
+ROW_SUMS = 3
+
+
+def ssim_window() -> np.ndarray:
+    """(11,) float32 Gaussian weights, sigma 1.5, that sum to 1."""
+    offsets = np.arange(-RADIUS, RADIUS + 1)
+    weights = np.exp(-0.5 * (offsets / 1.5) ** 2)
+    return (weights / weights.sum()).astype(np.float32)
+
+
+@kernel
+def prepare_target(claimed, colour, width, height, depth, target, valid_counts):
+    """Turn (h, w, 3) uint8 colour into three float planes 0 to 1; count valid depths per row."""
+    plane = width * height
+    scale = _ONE / f32(255.0)
+    while True:
+        row = claim(claimed, np.int64(1))
+        if row >= height:
+            break
+        begin = row * width
+        for k in range(3):
+            for i in range(begin, begin + width):
+                target[k * plane + i] = f32(colour[3 * i + k]) * scale
+        valid = 0
+        for i in range(begin, begin + width):
+            valid += np.int64(depth[i] > _ZERO)
+        valid_counts[row] = valid
+
+
+@inlined
+def _along_row(line, start, window):
+    """The window along a row whose element `start + RADIUS` belongs to the first lane."""
+    total = load(line, start) * splat(window[0])
+    for k in range(1, 2 * RADIUS + 1):
+        total = fma(load(line, start + k), splat(window[k]), total)
+    return total
+
+
+@kernel
+def ssim_maps(claimed, image, target, width, height, weight, has_weight, window,
+              share, maps, row_sums):  # fmt: skip
+    """maps (3 channels x 3 maps, h, w): share W (dS/dmu_x, dS/dE xx, dS/dE xy); sums of W S.
+
+    share is the loss's derivative by one pixel's S.
+    """
+    plane = width * height
+    padded = (width + LANES - 1) // LANES * LANES
+    stride = padded + 2 * RADIUS + LANES
+    lines = np.zeros(5 * stride, np.float32)
+    out = np.zeros(4 * padded, np.float32)
+    while True:
+        row = claim(claimed, np.int64(1))
+        if row >= height:
+            break
+        first, last = max(row - RADIUS, 0), min(row + RADIUS, height - 1)
+        total = 0.0
+        for channel in range(3):
+            base = channel * plane
+            for x in range(0, padded, LANES):
+                m_x, m_y = splat(_ZERO), splat(_ZERO)
+                m_xx, m_yy, m_xy = splat(_ZERO), splat(_ZERO), splat(_ZERO)
+                for r in range(first, last + 1):
+                    w = splat(window[r - row + RADIUS])
+                    a = load(image, base + r * width + x)
+                    b = load(target, base + r * width + x)
+                    wa, wb = w * a, w * b
+                    m_x, m_y = m_x + wa, m_y + wb
+                    m_xx, m_yy, m_xy = fma(wa, a, m_xx), fma(wb, b, m_yy), fma(wa, b, m_xy)
+                to = RADIUS + x
+                store(lines, to, m_x)
+                store(lines, stride + to, m_y)
+                store(lines, 2 * stride + to, m_xx)
+                store(lines, 3 * stride + to, m_yy)
+                store(lines, 4 * stride + to, m_xy)
+            for k in range(5):
+                for x in range(RADIUS + width, stride):
+                    lines[k * stride + x] = _ZERO
+            for x in range(0, padded, LANES):
+                mu_x, mu_y = _along_row(lines, x, window), _along_row(lines, stride + x, window)
+                e_xx = _along_row(lines, 2 * stride + x, window)
+                e_yy = _along_row(lines, 3 * stride + x, window)
+                e_xy = _along_row(lines, 4 * stride + x, window)
+                two = splat(_TWO)
+                product, squares = mu_x * mu_y, fma(mu_x, mu_x, mu_y * mu_y)
+                a1, b1 = fma(two, product, splat(_C1)), squares + splat(_C1)
+                a2 = fma(two, e_xy - product, splat(_C2))
+                b2 = (e_xx + e_yy) - squares + splat(_C2)
+                inverse = splat(_ONE) / (b1 * b2)
+                similarity = a1 * a2 * inverse
+                by_xy = two * a1 * inverse
+                by_xx = splat(_ZERO) - similarity * b1 * inverse
+                by_mu = fnma(two * mu_x, similarity * b2 * inverse, two * mu_y * a2 * inverse)
+                by_mu = fnma(mu_y, by_xy, fnma(two * mu_x, by_xx, by_mu))
+                store(out, x, by_mu)
+                store(out, padded + x, by_xx)
+                store(out, 2 * padded + x, by_xy)
+                store(out, 3 * padded + x, similarity)
+            begin = row * width
+            for x in range(width):
+                pixel_weight = weight[begin + x] if has_weight else _ONE
+                total += np.float64(pixel_weight * out[3 * padded + x])
+                for k in range(3):
+                    to = (3 * channel + k) * plane + begin + x
+                    maps[to] = share * pixel_weight * out[k * padded + x]
+        row_sums[row, 1] = total
+
+
+@kernel
+def image_gradient(claimed, image, target, width, height, depth, weight, has_weight, window,
+                   maps, l1_share, depth_share, gradient, row_sums):  # fmt: skip
+    """gradient (5, h, w) of the weighted losses by the image; sums of the L1 terms per row.
+
+    l1_share and depth_share are the loss's derivatives by one pixel's |x - y| and |z - d|.
+    """
+    plane = width * height
+    padded = (width + LANES - 1) // LANES * LANES
+    stride = padded + 2 * RADIUS + LANES
+    lines = np.zeros(3 * stride, np.float32)
+    out = np.zeros(padded, np.float32)
+    while True:
+        row = claim(claimed, np.int64(1))
+        if row >= height:
+            break
+        first, last = max(row - RADIUS, 0), min(row + RADIUS, height - 1)
+        begin = row * width
+        colour_sum, depth_sum = 0.0, 0.0
+        for channel in range(3):
+            for x in range(0, padded, LANES):
+                for k in range(3):
+                    total = splat(_ZERO)
+                    for r in range(first, last + 1):
+                        at = (3 * channel + k) * plane + r * width + x
+                        total = fma(load(maps, at), splat(window[r - row + RADIUS]), total)
+                    store(lines, k * stride + RADIUS + x, total)
+            for k in range(3):
+                for x in range(RADIUS + width, stride):
+                    lines[k * stride + x] = _ZERO
+            base = channel * plane + begin
+            for x in range(0, padded, LANES):
+                by_mu = _along_row(lines, x, window)
+                by_xx = _along_row(lines, stride + x, window)
+                by_xy = _along_row(lines, 2 * stride + x, window)
+                total = fma(splat(_TWO) * load(image, base + x), by_xx, by_mu)
+                store(out, x, fma(load(target, base + x), by_xy, total))
+            for x in range(width):
+                pixel_weight = weight[begin + x] if has_weight else _ONE
+                difference = image[base + x] - target[base + x]
+                sign = f32(difference > _ZERO) - f32(difference < _ZERO)
+                gradient[base + x] = out[x] + l1_share * pixel_weight * sign
+                colour_sum += np.float64(pixel_weight * abs(difference))
+        for x in range(width):
+            i = begin + x
+            pixel_weight = weight[i] if has_weight else _ONE
+            if not depth[i] > _ZERO:
+                pixel_weight = _ZERO
+            difference = image[3 * plane + i] - depth[i]
+            sign = f32(difference > _ZERO) - f32(difference < _ZERO)
+            gradient[3 * plane + i] = depth_share * pixel_weight * sign
+            gradient[4 * plane + i] = _ZERO
+            depth_sum += np.float64(pixel_weight * abs(difference))
+        row_sums[row, 0] = colour_sum
+        row_sums[row, 2] = depth_sum
