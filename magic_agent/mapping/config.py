@@ -72,6 +72,9 @@ class MappingConfig:
     regularisation_weight: float = 1.0
     """Weight of the scale regularisation."""
 
+    means_rate_m: float = 1e-3
+    """Adam step of the means in metres: larger than in offline 3DGS, as few steps are taken."""
+
     def resolved(self) -> MappingConfig:
         """This config with the schedule's values put in, after checking the ranges."""
         config = paper_schedule(self) if self.schedule == "paper" else self

@@ -15,7 +15,7 @@ from magic_core.data import Frame
 from magic_core.errors import WrongState
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
-from magic_core.render import GaussianOptimiser, LossWeights, RenderedView
+from magic_core.render import GaussianOptimiser, LearningRates, LossWeights, RenderedView
 from magic_core.submap import Keyframe
 
 Pose = NDArray[np.float64]
@@ -88,6 +88,7 @@ class Mapper:
                 depth=self._config.depth_weight,
                 scale=self._config.regularisation_weight,
             ),
+            learning_rates=LearningRates(means=self._config.means_rate_m),
             threads=self._threads,
         )
         return self.insert(frame, se3.identity())
