@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
 
 from magic_agent.slam_config import SlamConfig
 from magic_core.errors import ConfigError
@@ -32,7 +35,7 @@ class AgentConfig(SlamConfig):
     known_start: bool = False
     """Start from the first ground-truth pose of the data (the paper's setting) instead of an
     unknown pose."""
-    rate_hz: float = 0.0
+    rate_hz: Annotated[float, tyro.conf.arg(aliases=("--rate",))] = 0.0
     """Play the data in real time at this many frames per second, dropping what cannot be kept up
     with; 0 processes every frame, however long it takes."""
     queue_frames: int = 4

@@ -12,6 +12,9 @@ from magic_core.errors import ConfigError
 
 T = TypeVar("T")
 
+STYLE = (tyro.conf.FlagCreatePairsOff,)
+"""A switch is `--json`, or `--no-report` where it is on by default; never both."""
+
 
 def parse(cls: type[T], arguments: list[str], *, prog: str, description: str) -> T:
     """Parse a command line into a config of class `cls`.
@@ -22,8 +25,10 @@ def parse(cls: type[T], arguments: list[str], *, prog: str, description: str) ->
     config_path, rest = _take_config(arguments)
     default = load_yaml(cls, config_path) if config_path else None
     if default is None:
-        return tyro.cli(cls, args=rest, prog=prog, description=description)
-    return tyro.cli(cls, args=rest, prog=prog, description=description, default=default)
+        return tyro.cli(cls, args=rest, prog=prog, description=description, config=STYLE)
+    return tyro.cli(
+        cls, args=rest, prog=prog, description=description, config=STYLE, default=default
+    )
 
 
 def _take_config(arguments: list[str]) -> tuple[Path | None, list[str]]:

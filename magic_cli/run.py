@@ -24,7 +24,12 @@ from magic_agent.config import AgentConfig
 from magic_cli.options import parse
 from magic_cli.output import print_json
 from magic_core.config import field_names, save_yaml
-from magic_server.config import ServerConfig
+from magic_server.config import ListenConfig, ServerConfig
+from magic_server.globalmap import MergeConfig
+from magic_server.jobs import JobConfig
+from magic_server.loops import LoopConfig
+from magic_server.posegraph import PoseGraphConfig
+from magic_server.registration import RegistrationConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,8 +52,16 @@ class RunConfig(AgentConfig):
     """Longest wait for the merged map."""
     report: bool = True
     """Write report.html and overview.png."""
-    server: ServerConfig = field(default_factory=ServerConfig)
-    """The server's settings; its address and folder are chosen by the run."""
+    candidates: LoopConfig = field(default_factory=LoopConfig)
+    """Server: which similar places are verified."""
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    """Server: how two places are registered and what is believed."""
+    posegraph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    """Server: how the pose graph is solved."""
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    """Server: how the global map is made."""
+    jobs: JobConfig = field(default_factory=JobConfig)
+    """Server: its worker processes."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -96,11 +109,13 @@ def agent_settings(config: RunConfig) -> dict:
 
 
 def server_settings(config: RunConfig, folder: Path) -> ServerConfig:
-    """The server's settings with what the run decides put in."""
-    return dataclasses.replace(
-        config.server,
-        host="127.0.0.1",
-        port=0,
+    """The settings of the run's server: on loopback, on any free port, its store in `folder`."""
+    return ServerConfig(
         data_dir=folder,
-        loops=dataclasses.replace(config.server.loops, enabled=config.loops == "on"),
+        listen=ListenConfig(port=0),
+        jobs=config.jobs,
+        loops=dataclasses.replace(config.candidates, enabled=config.loops == "on"),
+        registration=config.registration,
+        posegraph=config.posegraph,
+        merge=config.merge,
     )
