@@ -11,7 +11,6 @@ import contextlib
 import signal
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from magic_agent.client import MagicClient
 from magic_cli import processes

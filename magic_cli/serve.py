@@ -35,9 +35,10 @@ def main(arguments: list[str]) -> int:
     """Serve until told to stop; 0 after a clean end."""
     command = parse(ServeCommand, arguments, prog="magic serve", description=__doc__ or "")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    from magic_server.server import serve
+    from magic_server.server import Server, serve
 
-    def ready(target: str) -> None:
+    def ready(server: Server) -> None:
+        target = server.address
         if command.progress == "json":
             sys.stdout.write(json.dumps({"ready": True, "target": target}) + "\n")
             sys.stdout.flush()

@@ -30,6 +30,8 @@ class SubmapKey:
 class LoopConfig:
     """How loop candidates are chosen from the nearest descriptors."""
 
+    enabled: bool = True
+    """Without it no candidate is chosen: every agent keeps its own odometry (an ablation)."""
     min_similarity: float | None = None
     """Least cosine similarity of the anchor descriptors; None takes the encoder's calibrated one."""
     top_k: int = 6
@@ -82,6 +84,8 @@ def select_candidates(
     Leaves out the query itself, its neighbours in the same agent, what is less similar than the
     encoder's threshold, pairs tried before, and more than a few of one agent (diversity).
     """
+    if not config.enabled:
+        return []
     threshold = config.threshold(model_id)
     chosen: list[LoopCandidate] = []
     for hit, similarity in sorted(hits, key=lambda item: (-item[1], item[0].name)):
