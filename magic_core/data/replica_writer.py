@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from magic_core.data.replica import RESULTS_FOLDER, TRAJECTORY_FILE
 from magic_core.errors import DataError
 
 _JPEG_QUALITY = 95
+_WRITERS = 2  # frames in work at once; a source's frames may be read from several threads
 _MAX_DEPTH_UNITS = np.iinfo(np.uint16).max
 
 
@@ -59,11 +61,17 @@ def _write_source(
     agent = folder / source.name
     (agent / RESULTS_FOLDER).mkdir(parents=True)
     write_intrinsics(agent / CAMERA_FILE, Intrinsics(source.camera, depth_scale, rate_hz=rate_hz))
-    poses = []
-    for number, frame in enumerate(source):
+
+    def write(number: int) -> str:
+        frame = source[number]
         _write_images(agent / RESULTS_FOLDER, number, frame, depth_scale)
-        poses.append(_pose_line(frame))
-        yield start + number + 1
+        return _pose_line(frame)
+
+    poses = []
+    with ThreadPoolExecutor(_WRITERS, thread_name_prefix="write-replica") as pool:
+        for line in pool.map(write, range(len(source))):
+            poses.append(line)
+            yield start + len(poses)
     if any("nan" not in line for line in poses):
         (agent / TRAJECTORY_FILE).write_text("\n".join(poses) + "\n")
 

@@ -62,12 +62,12 @@ def bake(
     albedo, emission = _patch_colours(mesh)
     direct = _lamp_light(mesh, caster, lamps, samples=config.lamp_samples, rng=rng)
     hits = _gather(mesh, caster, directions=config.directions, rng=rng)
-    first: Float32 = direct + _mean_over_hits(hits, emission[mesh.triangle_patch])
+    first = direct + _mean_over_hits(hits, emission[mesh.triangle_patch])
     total = first
     for _ in range(config.bounces):
         leaving = total[mesh.triangles].mean(axis=1) * albedo[mesh.triangle_patch]
         total = first + _mean_over_hits(hits, leaving.astype(np.float32))
-    return _smoothed(mesh, total) + np.float32(config.ambient)
+    return _smoothed(mesh, np.asarray(total, np.float32)) + np.float32(config.ambient)
 
 
 def _patch_colours(mesh: Mesh) -> tuple[Float32, Float32]:

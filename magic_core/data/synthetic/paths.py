@@ -15,9 +15,9 @@ from magic_core.geometry import se3
 
 Array = NDArray[np.float64]
 
-STEP_M = 0.023
+STEP_M = 0.030
 """Translation that costs a whole frame."""
-TURN_RAD = np.deg2rad(1.2)
+TURN_RAD = np.deg2rad(1.6)
 """Rotation that costs a whole frame."""
 STRETCH = 0.55
 """How far along each agent starts after the previous one, as a share of its length."""
