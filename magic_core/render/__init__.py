@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from magic_core.render.api import GaussianTensors, Rendering, render
     from magic_core.render.optimiser import (
         GaussianOptimiser,
         LearningRates,
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from magic_core.render.rasteriser import Gradients, Rasteriser, RenderedView
 
 _HOMES = {
+    "GaussianTensors": "api",
+    "Rendering": "api",
+    "render": "api",
     "GaussianOptimiser": "optimiser",
     "LearningRates": "optimiser",
     "LossWeights": "optimiser",
@@ -29,12 +33,15 @@ _HOMES = {
 
 __all__ = [
     "GaussianOptimiser",
+    "GaussianTensors",
     "Gradients",
     "LearningRates",
     "LossWeights",
     "Rasteriser",
     "RenderedView",
+    "Rendering",
     "StepReport",
+    "render",
 ]
 
 

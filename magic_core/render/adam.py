@@ -2,8 +2,8 @@
 
 The optimiser's parameters are mean, quaternion, log(scale), logit(opacity) and colour: 14 per
 Gaussian. Gradients arrive by natural values and are chained here. A Gaussian that was not drawn
-keeps its parameters and moments (as if it had not been in the problem); each counts its own steps, so
-that the bias correction is right for Gaussians that joined later:
+keeps its parameters and moments (as if it had not been in the problem); each counts its own
+steps, so that the bias correction is right for Gaussians that joined later:
 
     m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2,
     p <- p - rate m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + eps).

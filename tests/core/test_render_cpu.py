@@ -113,7 +113,7 @@ def test_any_image_size_shows_the_same_pixels(size):
     # All centres on the first pixel: the Jacobian's clamp, which depends on the size, stays idle.
     cloud = random_cloud(60)
     depth = cloud.means[:, 2:]
-    cloud = dataclasses.replace(cloud, means=depth * np.float32([-0.4, -0.18, 1.0]))
+    cloud = dataclasses.replace(cloud, means=depth * np.array([-0.4, -0.18, 1.0], np.float32))
     small = Rasteriser(1).render(cloud, camera, np.eye(4))
     large = Rasteriser(1).render(cloud, larger, np.eye(4))
     np.testing.assert_allclose(small.image, large.image[:, :height, :width], atol=3e-6)
