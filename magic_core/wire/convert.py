@@ -44,6 +44,11 @@ def _key_of(table: dict[_K, _V], value: _V, default: _K) -> _K:
     return next((key for key, number in table.items() if number == value), default)
 
 
+def moment(seconds: float) -> datetime:
+    """Seconds since 1970 as UTC time."""
+    return datetime.fromtimestamp(seconds, UTC)
+
+
 def timestamp_to_proto(moment: datetime) -> Timestamp:
     """A UTC time as its message."""
     message = Timestamp()

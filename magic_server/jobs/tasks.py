@@ -21,7 +21,12 @@ from magic_server.store.rows import StoredSubmap
 if TYPE_CHECKING:
     from magic_server.globalmap import MergeConfig
     from magic_server.posegraph import PoseGraphConfig, PoseGraphProblem, PoseGraphSolution
-    from magic_server.registration import AnchorView, RegistrationConfig, RegistrationResult
+    from magic_server.registration import (
+        AnchorView,
+        PreparedView,
+        RegistrationConfig,
+        RegistrationResult,
+    )
 
 _PROGRESS_INTERVAL_S = 0.2
 
@@ -63,9 +68,7 @@ def verify_loop(
     """Register the views of two sub-maps."""
     from magic_server.registration import register
 
-    return register(
-        _view(source, config.max_keyframes), _view(target, config.max_keyframes), config
-    )
+    return register(_prepared(source, config), _prepared(target, config), config)
 
 
 def solve_pose_graph(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSolution:
@@ -111,8 +114,15 @@ def read_progress(folder: Path) -> tuple[float, str] | None:
 
 
 @functools.lru_cache(maxsize=16)
+def _prepared(stored: StoredSubmap, config: RegistrationConfig) -> PreparedView:
+    """A sub-map's view; kept, because a new sub-map is compared with several others in a row."""
+    from magic_server.registration import prepare
+
+    return prepare(_view(stored, config.max_keyframes), config)
+
+
 def _view(stored: StoredSubmap, max_keyframes: int) -> AnchorView:
-    """The images of a sub-map that registration wants; the anchor's and some keyframes'."""
+    """The images of a sub-map that registration wants: the anchor's and some keyframes'."""
     from magic_server.registration import AnchorView
 
     header = submap_pb2.SubmapHeader.FromString(stored.header)

@@ -9,8 +9,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from magic_core.errors import DescriptorModelMismatch, NotFound, WrongState
 from magic_core.wire import names, records
+from magic_core.wire.convert import moment
 from magic_server.store.database import Database
-from magic_server.store.rows import AgentRow, SessionRow, moment
+from magic_server.store.rows import AgentRow, SessionRow
 from magic_server.store.schema import agents, loops, sessions, snapshots, submaps
 
 

@@ -10,8 +10,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from magic_core.errors import MagicError, NotFound
 from magic_core.wire import names, records
+from magic_core.wire.convert import moment
 from magic_server.store.database import Database
-from magic_server.store.rows import MapFile, SessionRow, moment
+from magic_server.store.rows import MapFile, SessionRow
 from magic_server.store.schema import map_files, maps, operations, sessions
 
 

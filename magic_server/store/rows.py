@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -76,11 +75,6 @@ class MapFile:
 
     sha256: str
     length: int
-
-
-def moment(seconds: float) -> datetime:
-    """Seconds since 1970 as UTC time."""
-    return datetime.fromtimestamp(seconds, UTC)
 
 
 def pack(array: ArrayLike | None) -> bytes | None:

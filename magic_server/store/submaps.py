@@ -11,6 +11,7 @@ from magicslam.v1 import submap_pb2
 from magic_core.errors import NotFound
 from magic_core.submap import Descriptor, OdometryEdge
 from magic_core.wire import names, records
+from magic_core.wire.convert import moment
 from magic_server.store.blobs import BlobFolder
 from magic_server.store.database import Database
 from magic_server.store.rows import (
@@ -19,7 +20,6 @@ from magic_server.store.rows import (
     SessionRow,
     StoredSubmap,
     Vertex,
-    moment,
     pack,
     unpack,
 )

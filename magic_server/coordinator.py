@@ -1,0 +1,280 @@
+"""What happens to a session's sub-maps after they are stored.
+
+A new sub-map is compared with all others by descriptor; pairs that look alike are verified by
+registration; the pose graph is solved again whenever a sub-map or an accepted loop arrives. The
+heavy parts run as jobs. Everything is in the store before anyone hears of it, so that a server that
+is started again goes on where it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+from collections import deque
+from concurrent.futures import Executor
+
+import numpy as np
+
+from magic_core.wire import names, records
+from magic_server.config import ServerConfig
+from magic_server.graph import SessionGraph, initial_board
+from magic_server.jobs import JobExecutor
+from magic_server.jobs.tasks import solve_pose_graph, verify_loop
+from magic_server.loops import SubmapKey, select_candidates
+from magic_server.places import DescriptorIndex
+from magic_server.store import SessionRow, Store, StoredSubmap, Vertex
+from magic_server.tasks import TaskScope
+
+logger = logging.getLogger(__name__)
+
+QUERY_MARGIN = 8
+"""So many times more neighbours are fetched than candidates wanted, since some are left out."""
+
+
+class SessionCoordinator:
+    """One session's descriptor index, pending verifications, pose graph and newest solution."""
+
+    def __init__(
+        self,
+        session: SessionRow,
+        store: Store,
+        *,
+        jobs: JobExecutor,
+        threads: Executor,
+        config: ServerConfig,
+    ) -> None:
+        self.session = session
+        self.graph = SessionGraph(session.name)
+        self.board = initial_board(session.name, None)
+        self._store = store
+        self._jobs = jobs
+        self._threads = threads
+        self._config = config
+        self._index = DescriptorIndex(session.dimension)
+        self._index_lock = asyncio.Lock()
+        self._arrived: deque[Vertex] = deque()
+        self._pending: deque[records.LoopCandidate] = deque()
+        self._verifying = 0
+        self._searching = False
+        self._dirty = False
+        self._solving = False
+        self._wake = asyncio.Event()
+        self._work_done = asyncio.Condition()
+        self._tasks = TaskScope(f"session {session.name}")
+
+    async def start(self) -> None:
+        """Rebuild everything from the store and begin to work."""
+        vertices = await self._store.submaps.vertices(self.session)
+        for vertex in vertices:
+            self.graph.add_vertex(vertex)
+            if vertex.searched:
+                await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
+            else:
+                self._arrived.append(vertex)
+        for loop in await self._store.loops.all(self.session):
+            self.graph.set_loop(loop)
+            if loop.verdict == "PENDING":
+                self._pending.append(loop)
+        self.board = initial_board(
+            self.session.name, await self._store.loops.solution(self.session)
+        )
+        self._dirty = len(self.board.snapshot.poses) != len(vertices) or (
+            self.board.snapshot.loop_count != self.graph.accepted_count
+        )
+        for worker in range(self._jobs.workers):
+            self._tasks.start(self._verify_for_ever(), name=f"verify {worker}")
+        self._tasks.start(self._search_for_ever(), name="search")
+        self._tasks.start(self._solve_for_ever(), name="solve")
+
+    async def close(self) -> None:
+        """Stop working; what was begun is done again after the next start."""
+        await self._tasks.close()
+
+    def submap_stored(self, vertex: Vertex) -> None:
+        """Tell of a sub-map that is durable. Returns at once."""
+        self.graph.add_vertex(vertex)
+        self._arrived.append(vertex)
+        self._dirty = True
+        self._notify()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a search, a verification or a solve is waiting or under way."""
+        waiting = self._arrived or self._pending or self._dirty
+        return bool(waiting or self._searching or self._verifying or self._solving)
+
+    @property
+    def pending_loops(self) -> int:
+        """Candidates that wait for, or are under, verification."""
+        return len(self._pending) + self._verifying
+
+    async def idle(self, timeout_s: float) -> bool:
+        """Wait until nothing is left to do; False when that took too long."""
+        try:
+            async with asyncio.timeout(timeout_s), self._work_done:
+                await self._work_done.wait_for(lambda: not self.busy)
+        except TimeoutError:
+            return False
+        return True
+
+    async def nearest(
+        self, vector: np.ndarray, *, count: int, min_similarity: float
+    ) -> list[records.LoopCandidate]:
+        """The sub-maps most similar to a raw descriptor (d,), best first."""
+        async with self._index_lock:
+            hits = await self._in_thread(self._index.query, vector, count)
+        return [
+            records.LoopCandidate("", name, similarity, "SIMILAR", "NOT_VERIFIED")
+            for name, similarity in hits
+            if similarity >= min_similarity
+        ]
+
+    # Search: which pairs look alike
+
+    async def _search_for_ever(self) -> None:
+        while True:
+            if not self._arrived:
+                await self._sleep()
+                continue
+            self._searching = True
+            vertex = self._arrived.popleft()
+            try:
+                await self._search(vertex)
+            except Exception:
+                # The store does not say "searched": the next start looks again.
+                logger.exception("looking for loops of %s failed", vertex.name)
+            finally:
+                self._searching = False
+                await self._tell_idle()
+
+    async def _search(self, vertex: Vertex) -> None:
+        config = self._config.loops
+        async with self._index_lock:
+            hits = await self._in_thread(
+                self._index.query, vertex.descriptor.vector, config.top_k * QUERY_MARGIN
+            )
+            await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
+        chosen = select_candidates(
+            _key(vertex.name),
+            [(_key(name), similarity) for name, similarity in hits],
+            config,
+            model_id=self.session.model_id,
+            is_known_pair=self.graph.knows_pair,
+        )
+        found = [
+            records.LoopCandidate(c.query.name, c.hit.name, c.similarity, "PENDING", "PENDING")
+            for c in chosen
+        ]
+        await self._store.loops.add_candidates(self.session, vertex.name, found)
+        for loop in found:
+            self.graph.set_loop(loop)
+        self._pending.extend(found)
+        logger.info("%s: %d loop candidates", vertex.name, len(found))
+        self._notify()
+
+    # Verification: which of them are the same place
+
+    async def _verify_for_ever(self) -> None:
+        while True:
+            if not self._pending:
+                await self._sleep()
+                continue
+            loop = self._pending.popleft()
+            self._verifying += 1
+            try:
+                settled = await self._verified(loop)
+                await self._store.loops.settle(self.session, settled)
+                self.graph.set_loop(settled)
+                if settled.verdict == "ACCEPTED":
+                    self._dirty = True
+                    self._notify()
+            except Exception:
+                # The store still says "pending": the next start verifies again.
+                logger.exception("storing the verdict on %s failed", loop.source)
+            finally:
+                self._verifying -= 1
+                await self._tell_idle()
+
+    async def _verified(self, loop: records.LoopCandidate) -> records.LoopCandidate:
+        """The candidate with its verdict; a job that fails is a refusal with its own reason."""
+        try:
+            source, target = await self._stored(loop.source), await self._stored(loop.target)
+            result = await self._jobs.run(verify_loop, source, target, self._config.registration)
+        except Exception:
+            logger.exception("verification of %s -> %s failed", loop.source, loop.target)
+            return dataclasses.replace(loop, verdict="REJECTED", reason="VERIFICATION_FAILED")
+        logger.info("%s -> %s: %s", loop.source, loop.target, result.reason)
+        return dataclasses.replace(
+            loop,
+            verdict="ACCEPTED" if result.accepted else "REJECTED",
+            reason=result.reason,
+            target_from_source=result.target_from_source if result.accepted else None,
+            information=result.information if result.accepted else None,
+            fitness=float(result.fitness),
+            rmse_m=float(result.rmse_m),
+            inliers=int(result.inliers),
+            overlap=float(result.overlap),
+            verify_seconds=float(result.seconds),
+        )
+
+    async def _stored(self, name: str) -> StoredSubmap:
+        _, agent, index = names.parse_submap(name)
+        return await self._store.submaps.stored(self.session, agent, index)
+
+    # Solving: where everything is
+
+    async def _solve_for_ever(self) -> None:
+        while True:
+            if not self._dirty:
+                await self._sleep()
+                continue
+            self._dirty, self._solving = False, True
+            try:
+                await self._solve()
+            except Exception:
+                # The last solution stays; the next sub-map or loop tries again.
+                logger.exception("solving the pose graph of %s failed", self.session.name)
+            finally:
+                self._solving = False
+                await self._tell_idle()
+
+    async def _solve(self) -> None:
+        problem = await self._in_thread(self.graph.problem)
+        solution = await self._jobs.run(solve_pose_graph, problem, self._config.posegraph)
+        revision = self.board.revision + 1
+        message, data, kept = await self._in_thread(self.graph.solved, problem, solution, revision)
+        await self._store.loops.save_solution(
+            self.session, revision=revision, snapshot=data, kept=kept
+        )
+        self.graph.remember(solution)
+        self.board.publish(message)
+        logger.info(
+            "%s: revision %d, %d sub-maps in %d components",
+            self.session.name,
+            revision,
+            len(message.poses),
+            len(message.components),
+        )
+
+    # Waiting and waking
+
+    def _notify(self) -> None:
+        wake, self._wake = self._wake, asyncio.Event()
+        wake.set()
+
+    async def _sleep(self) -> None:
+        await self._wake.wait()
+
+    async def _tell_idle(self) -> None:
+        if not self.busy:
+            async with self._work_done:
+                self._work_done.notify_all()
+
+    async def _in_thread(self, function, *arguments):
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _key(name: str) -> SubmapKey:
+    session, agent, index = names.parse_submap(name)
+    return SubmapKey(agent=names.agent_name(session, agent), index=index, name=name)

@@ -1,0 +1,232 @@
+"""Merging as an operation: wait for open loops, merge in a worker, keep the files."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import shutil
+import tempfile
+import time
+from concurrent.futures import Executor
+from pathlib import Path
+
+from magicslam.v1 import global_map_service_pb2 as map_pb
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
+
+from magic_core.errors import InvalidInput, MagicError, NotFound, WrongState
+from magic_core.wire import geometry, names, records
+from magic_server.config import ServerConfig
+from magic_server.coordinator import SessionCoordinator
+from magic_server.jobs import JobExecutor
+from magic_server.jobs.tasks import (
+    MergeOutcome,
+    MergeTask,
+    PlacedFiles,
+    merge_submaps,
+    read_progress,
+)
+from magic_server.sessions import Sessions
+from magic_server.store import BlobWriter, MapFile, NewMap, SessionRow, Store
+from magic_server.tasks import TaskScope
+
+logger = logging.getLogger(__name__)
+
+POLL_S = 0.25
+_COPY_BYTES = 1 << 20
+
+
+class GlobalMaps:
+    """Operations that merge, and the progress of those under way."""
+
+    def __init__(
+        self,
+        store: Store,
+        sessions: Sessions,
+        *,
+        jobs: JobExecutor,
+        threads: Executor,
+        config: ServerConfig,
+    ) -> None:
+        self._store = store
+        self._sessions = sessions
+        self._jobs = jobs
+        self._threads = threads
+        self._config = config
+        self._tasks = TaskScope("global maps")
+        self._changed = asyncio.Event()
+
+    async def start(self) -> None:
+        """Begin again with every operation that a stopped server left open."""
+        for operation in await self._store.maps.unfinished():
+            session = await self._store.agents.session(operation.session)
+            self._begin(operation.id, session, operation.request)
+
+    async def close(self) -> None:
+        """Stop; operations under way begin again after the next start."""
+        await self._tasks.close()
+
+    async def build(self, request: map_pb.BuildGlobalMapRequest) -> records.OperationStatus:
+        """The operation of a request, begun now unless it was before."""
+        name = names.parse_session(request.session, field="session")
+        session = await self._store.agents.session(name)
+        if not 0.0 <= request.drain_timeout_s <= 86400.0:
+            raise InvalidInput.field("drain_timeout_s", "expected 0 to 86400 seconds")
+        operation, new = await self._store.maps.begin(session, request, now=time.time())
+        if new:
+            self._begin(operation, session, request)
+        return await self._store.maps.operation(name, str(operation))
+
+    async def wait(
+        self, session: str, operation: str, *, timeout_s: float, above_progress: float
+    ) -> records.OperationStatus:
+        """The operation once it is done or its progress is above a share, or after the timeout."""
+        end = time.monotonic() + timeout_s
+        while True:
+            changed = self._changed
+            status = await self._store.maps.operation(session, operation)
+            left = end - time.monotonic()
+            if status.done or left <= 0 or status.progress > above_progress:
+                return status
+            try:
+                async with asyncio.timeout(left):
+                    await changed.wait()
+            except TimeoutError:
+                continue
+
+    def _begin(
+        self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
+    ) -> None:
+        work = self._run(operation, session, request)
+        self._tasks.start(work, name=f"{session.name}/{operation}")
+
+    async def _run(
+        self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
+    ) -> None:
+        try:
+            await self._merge(operation, session, request)
+        except MagicError as error:
+            await self._store.maps.fail(operation, error, now=time.time())
+        except Exception:
+            logger.exception("merging %s failed", session.name)
+            error = MagicError("the merge failed; the server's log says why")
+            await self._store.maps.fail(operation, error, now=time.time())
+        finally:
+            self._notify()
+
+    async def _merge(
+        self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
+    ) -> None:
+        coordinator = await self._sessions.coordinator(session)
+        await self._advance(operation, "PENDING", 0.0, "waiting for loops under verification")
+        timeout_s = request.drain_timeout_s or self._config.limits.drain_timeout_s
+        if not await coordinator.idle(timeout_s):
+            logger.warning("%s: merging with loops still open", session.name)
+        snapshot = coordinator.board.snapshot
+        chosen = chosen_poses(snapshot, request.component)
+        folder = Path(await self._in_thread(tempfile.mkdtemp, None, "merge-", self._store.folder))
+        try:
+            task = await self._task(coordinator, chosen, request, folder)
+            outcome = await self._followed(operation, task)
+            await self._keep(operation, session, snapshot.revision, chosen, outcome)
+        finally:
+            await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
+
+    async def _task(
+        self,
+        coordinator: SessionCoordinator,
+        chosen: list[mapping_pb.CorrectedPose],
+        request: map_pb.BuildGlobalMapRequest,
+        folder: Path,
+    ) -> MergeTask:
+        placed = []
+        for pose in chosen:
+            _, agent, index = names.parse_submap(pose.submap)
+            stored = await self._store.submaps.stored(coordinator.session, agent, index)
+            transform = geometry.pose_from_proto(pose.world_from_anchor)
+            placed.append(PlacedFiles(pose.submap, stored, transform))
+        config = self._config.merge
+        if request.coarse_only:
+            config = dataclasses.replace(config, refine=False, fill=False)
+        return MergeTask(tuple(placed), config, self._config.jobs.merge_threads, folder)
+
+    async def _followed(self, operation: int, task: MergeTask) -> MergeOutcome:
+        """Run the merge and store its progress while it goes on."""
+        await self._advance(operation, "RUNNING", 0.0, "starting")
+        job = self._tasks.start(self._jobs.run(merge_submaps, task), name="merge job")
+        last = None
+        while not job.done():
+            await asyncio.wait([job], timeout=POLL_S)
+            progress = await self._in_thread(read_progress, task.folder)
+            if progress is not None and progress != last:
+                last = progress
+                await self._advance(operation, "RUNNING", *progress)
+        return job.result()
+
+    async def _keep(
+        self,
+        operation: int,
+        session: SessionRow,
+        revision: int,
+        chosen: list[mapping_pb.CorrectedPose],
+        outcome: MergeOutcome,
+    ) -> None:
+        paths: dict[records.MapFormat, Path] = {
+            "ply": outcome.ply,
+            "lossless": outcome.lossless,
+            "compact": outcome.compact,
+        }
+        files: dict[records.MapFormat, MapFile] = {}
+        written: list[BlobWriter] = []
+        for kind, path in paths.items():
+            blob = await self._in_thread(self._copied, path)
+            written.append(blob)
+            files[kind] = MapFile(blob.sha256, blob.length)
+        made = NewMap(
+            component=chosen[0].component,
+            revision=revision,
+            submaps=tuple(pose.submap for pose in chosen),
+            gaussian_count=outcome.gaussian_count,
+            files=files,
+        )
+        now = time.time()
+        await self._store.add_map(operation, session, made, written=written, now=now)
+
+    def _copied(self, path: Path) -> BlobWriter:
+        """A file of a merge as a blob that is ready to be adopted."""
+        blob = self._store.blobs.writer()
+        with path.open("rb") as file:
+            while piece := file.read(_COPY_BYTES):
+                blob.write(piece)
+        blob.finish()
+        return blob
+
+    async def _advance(self, operation: int, state: str, progress: float, stage: str) -> None:
+        await self._store.maps.advance(
+            operation, state=state, progress=progress, stage=stage, now=time.time()
+        )
+        self._notify()
+
+    def _notify(self) -> None:
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()
+
+    async def _in_thread(self, function, *arguments):
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def chosen_poses(
+    snapshot: mapping_pb.PoseSnapshot, component: str
+) -> list[mapping_pb.CorrectedPose]:
+    """The poses of a component, the largest where none is named.
+
+    A component that has been joined to an older one is found under any of its sub-maps' names.
+    """
+    if not snapshot.poses:
+        raise WrongState(f"{snapshot.session} has no corrected sub-maps yet; nothing to merge")
+    wanted = component or snapshot.components[0].id
+    wanted = next((pose.component for pose in snapshot.poses if pose.submap == wanted), wanted)
+    chosen = [pose for pose in snapshot.poses if pose.component == wanted]
+    if not chosen:
+        raise NotFound(f"{snapshot.session} has no component {component!r}")
+    return chosen

@@ -1,0 +1,139 @@
+"""Watches that the event loop never stands still.
+
+A heartbeat runs in the loop every few milliseconds. When one comes late, the gap is a stall of the
+loop, less the time in which the machine gave its processors to others: on Linux the scheduler says
+how long each thread was ready to run but did not, and the loop can be held up by its own thread or
+by one that was put aside while holding the interpreter lock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import logging
+import sys
+import threading
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Self
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Stall:
+    """One time in which the loop did not run."""
+
+    seconds: float
+    """How long, less `waited_s`."""
+    gap_s: float
+    """Time between two heartbeats, less the interval."""
+    waited_s: float
+    """Share of it in which a thread of this process waited for a processor (0 where unknown)."""
+    cpu_s: float
+    """Processor time the loop's own thread used."""
+    gc_s: float
+    """Share of it spent collecting garbage."""
+    stack: str
+    """What the loop's thread was doing, where it was seen doing anything."""
+
+
+class LoopMonitor:
+    """Records stalls of the running event loop.
+
+        async with LoopMonitor(threshold_s=0.05) as monitor:
+            ...
+        assert not monitor.stalls
+
+    Only the longest 100 stalls are kept; `count` counts all.
+    """
+
+    def __init__(self, *, threshold_s: float = 0.05, interval_s: float = 0.005) -> None:
+        self.threshold_s = threshold_s
+        self.stalls: list[Stall] = []
+        self.count = 0
+        self.beats = 0
+        self.longest_s = 0.0
+        self._interval_s = interval_s
+        self._task: asyncio.Task[None] | None = None
+        self._watcher: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._thread_id = 0
+        self._last_beat = 0.0
+        self._seen = ""
+        self._gc_started = 0.0
+        self._gc_s = 0.0
+
+    async def __aenter__(self) -> Self:
+        self._thread_id = threading.get_ident()
+        self._last_beat = time.perf_counter()
+        gc.callbacks.append(self._on_gc)
+        self._watcher = threading.Thread(target=self._watch, name="loop-watcher", daemon=True)
+        self._watcher.start()
+        self._task = asyncio.create_task(self._beat(), name="loop monitor")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._stop.set()
+        gc.callbacks.remove(self._on_gc)
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task
+        if self._watcher is not None:
+            await asyncio.to_thread(self._watcher.join)
+
+    async def _beat(self) -> None:
+        waits, cpu = _waits(), time.thread_time()
+        while True:
+            self._gc_s = 0.0
+            self._last_beat = started = time.perf_counter()
+            await asyncio.sleep(self._interval_s)
+            gap = time.perf_counter() - started - self._interval_s
+            self.beats += 1
+            if gap > self.threshold_s:
+                self._record(gap, waits, cpu)
+            if gap > self.threshold_s or self.beats % 8 == 0:
+                waits = _waits()
+            cpu = time.thread_time()
+            self._seen = ""
+
+    def _record(self, gap: float, waits: dict[str, float], cpu: float) -> None:
+        now = _waits()
+        waited = max((now[t] - waits.get(t, 0.0) for t in now), default=0.0)
+        seconds = max(0.0, gap - waited)
+        self.longest_s = max(self.longest_s, seconds)
+        if seconds <= self.threshold_s:
+            return
+        used = time.thread_time() - cpu
+        stall = Stall(seconds, gap, waited, used, self._gc_s, self._seen)
+        self.count += 1
+        self.stalls = sorted([*self.stalls, stall], key=lambda s: -s.seconds)[:100]
+        logger.warning("the event loop stood still for %.0f ms\n%s", seconds * 1e3, stall.stack)
+
+    def _watch(self) -> None:
+        """Look at the loop's thread whenever its heartbeat is late."""
+        while not self._stop.wait(self.threshold_s / 4):
+            late = time.perf_counter() - self._last_beat - self._interval_s
+            if late > self.threshold_s / 2 and not self._seen:
+                frame: FrameType | None = sys._current_frames().get(self._thread_id)
+                self._seen = "".join(traceback.format_stack(frame, limit=12)) if frame else ""
+
+    def _on_gc(self, phase: str, _info: dict[str, int]) -> None:
+        if phase == "start":
+            self._gc_started = time.perf_counter()
+        elif threading.get_ident() == self._thread_id:
+            self._gc_s += time.perf_counter() - self._gc_started
+
+
+def _waits() -> dict[str, float]:
+    """Seconds that each thread of this process was ready to run but did not, by thread id."""
+    waits: dict[str, float] = {}
+    for file in Path("/proc/self/task").glob("*/schedstat"):
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            waits[file.parent.name] = int(file.read_text().split()[1]) * 1e-9
+    return waits

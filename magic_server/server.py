@@ -1,0 +1,156 @@
+"""The server: everything wired together, started, and stopped without losing anything."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import signal
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Self
+
+import grpc.aio
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+from magicslam.v1 import global_map_service_pb2 as map_pb
+from magicslam.v1 import global_map_service_pb2_grpc as map_grpc
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
+from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
+from magicslam.v1 import session_service_pb2 as session_pb
+from magicslam.v1 import session_service_pb2_grpc as session_grpc
+
+from magic_core.errors import Unavailable
+from magic_core.wire import server_options
+from magic_server.config import ServerConfig
+from magic_server.globalmaps import GlobalMaps
+from magic_server.interceptors import ErrorInterceptor
+from magic_server.jobs import ProcessExecutor
+from magic_server.receiving import SubmapReceiver
+from magic_server.servicers import GlobalMapServicer, MappingServicer, SessionServicer
+from magic_server.sessions import Sessions
+from magic_server.store import Store
+
+logger = logging.getLogger(__name__)
+
+SERVICES = tuple(
+    service.full_name
+    for file in (mapping_pb, map_pb, session_pb)
+    for service in file.DESCRIPTOR.services_by_name.values()
+)
+
+
+class Server:
+    """One server over one data folder.
+
+    async with Server(config) as server:
+        print(server.port)
+    """
+
+    def __init__(self, config: ServerConfig) -> None:
+        self.config = config
+        self.port = 0
+        threads = config.limits.io_threads
+        self._threads = ThreadPoolExecutor(threads, thread_name_prefix="magic-io")
+        self._jobs = ProcessExecutor(config.jobs)
+        self._store = Store(config.data_dir, self._threads)
+        shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
+        self.sessions = Sessions(self._store, **shared)
+        self._maps = GlobalMaps(self._store, self.sessions, **shared)
+        self._receiver = SubmapReceiver(self._store, threads=self._threads, limits=config.limits)
+        self._health = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
+        self._grpc: grpc.aio.Server | None = None
+
+    async def __aenter__(self) -> Self:
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    @property
+    def address(self) -> str:
+        """Where clients on this machine reach the server."""
+        host = self.config.listen.host
+        return f"{'127.0.0.1' if host in ('0.0.0.0', '::', '[::]') else host}:{self.port}"
+
+    async def start(self) -> None:
+        """Open the store, take up what was left, and serve."""
+        try:
+            await self._store.open()
+            await self.sessions.start()
+            await self._maps.start()
+            await self._listen()
+        except BaseException:
+            await self.stop()
+            raise
+        # What is alive now stays alive: the collector need not walk through it again.
+        gc.collect()
+        gc.freeze()
+        logger.info("serving on %s, data in %s", self.address, self.config.data_dir)
+
+    async def stop(self) -> None:
+        """Refuse new calls, let those under way finish, keep everything that was acknowledged."""
+        if self._grpc is not None:
+            await self._health.enter_graceful_shutdown()
+            await self._grpc.stop(self.config.listen.stop_grace_s)
+            self._grpc = None
+        await self._receiver.close()
+        await self._maps.close()
+        await self.sessions.close()
+        await self._jobs.close()
+        await self._store.close()
+        self._threads.shutdown(wait=True)
+        gc.unfreeze()
+
+    async def _listen(self) -> None:
+        listen = self.config.listen
+        server = grpc.aio.server(
+            interceptors=[ErrorInterceptor()], options=server_options(listen.transport)
+        )
+        self._add_services(server)
+        try:
+            self.port = server.add_insecure_port(f"{listen.host}:{listen.port}")
+        except RuntimeError as error:
+            where = f"{listen.host}:{listen.port}"
+            raise Unavailable(
+                f"cannot listen on {where}; is another server running? Choose another port"
+            ) from error
+        await server.start()
+        self._grpc = server
+        for name in ("", *SERVICES):
+            await self._health.set(name, health_pb2.HealthCheckResponse.SERVING)
+
+    def _add_services(self, server: grpc.aio.Server) -> None:
+        mapping = MappingServicer(
+            self._store,
+            self.sessions,
+            receiver=self._receiver,
+            threads=self._threads,
+            config=self.config,
+        )
+        mapping_grpc.add_MappingServiceServicer_to_server(mapping, server)
+        maps = GlobalMapServicer(self._store, self._maps, threads=self._threads)
+        map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
+        sessions = SessionServicer(self._store, threads=self._threads)
+        session_grpc.add_SessionServiceServicer_to_server(sessions, server)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
+        others = (health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection((*SERVICES, *others), server)
+
+
+async def serve(config: ServerConfig, *, on_ready: Callable[[Server], None] | None = None) -> None:
+    """Serve until SIGINT or SIGTERM; `on_ready` is called once the port is open."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    try:
+        async with Server(config) as server:
+            if on_ready is not None:
+                on_ready(server)
+            await stop.wait()
+            logger.info("stopping")
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)

@@ -1,0 +1,135 @@
+"""SessionService: reading, listing and deleting what is stored."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from concurrent.futures import Executor
+
+import grpc.aio
+from magicslam.v1 import session_service_pb2 as session_pb
+from magicslam.v1 import session_service_pb2_grpc as session_grpc
+from magicslam.v1 import submap_pb2
+
+from magic_core.errors import NotFound, NotSupported
+from magic_core.wire import convert, names
+from magic_server.servicers.downloads import file_chunks
+from magic_server.servicers.pages import page_limit, page_start, token_of
+from magic_server.store import Store
+
+Context = grpc.aio.ServicerContext
+
+
+class SessionServicer(session_grpc.SessionServiceServicer):
+    """Sessions, their agents and their sub-maps."""
+
+    def __init__(self, store: Store, *, threads: Executor) -> None:
+        self._store = store
+        self._threads = threads
+
+    async def GetSession(  # noqa: N802
+        self, request: session_pb.GetSessionRequest, context: Context
+    ) -> session_pb.GetSessionResponse:
+        session = names.parse_session(request.name)
+        found, _ = await self._store.agents.session_page(session=session)
+        if not found:
+            raise NotFound(f"{request.name} does not exist")
+        return session_pb.GetSessionResponse(session=convert.session_to_proto(found[0]))
+
+    async def ListSessions(  # noqa: N802
+        self, request: session_pb.ListSessionsRequest, context: Context
+    ) -> session_pb.ListSessionsResponse:
+        found, following = await self._store.agents.session_page(
+            after=page_start(request.page_token), limit=page_limit(request.page_size)
+        )
+        return session_pb.ListSessionsResponse(
+            sessions=[convert.session_to_proto(info) for info in found],
+            next_page_token=token_of(following),
+        )
+
+    async def DeleteSession(  # noqa: N802
+        self, request: session_pb.DeleteSessionRequest, context: Context
+    ) -> session_pb.DeleteSessionResponse:
+        raise NotSupported("this server does not delete sessions yet")
+
+    async def GetAgent(  # noqa: N802
+        self, request: session_pb.GetAgentRequest, context: Context
+    ) -> session_pb.GetAgentResponse:
+        session, agent = names.parse_agent(request.name)
+        row = await self._store.agents.session(session)
+        found, _ = await self._store.agents.agent_page(row, agent=agent)
+        if not found:
+            raise NotFound(f"{request.name} does not exist")
+        return session_pb.GetAgentResponse(agent=convert.agent_to_proto(found[0]))
+
+    async def ListAgents(  # noqa: N802
+        self, request: session_pb.ListAgentsRequest, context: Context
+    ) -> session_pb.ListAgentsResponse:
+        session = names.parse_session(request.session, field="session")
+        found, following = await self._store.agents.agent_page(
+            await self._store.agents.session(session),
+            after=page_start(request.page_token),
+            limit=page_limit(request.page_size),
+        )
+        return session_pb.ListAgentsResponse(
+            agents=[convert.agent_to_proto(info) for info in found],
+            next_page_token=token_of(following),
+        )
+
+    async def DeleteAgent(  # noqa: N802
+        self, request: session_pb.DeleteAgentRequest, context: Context
+    ) -> session_pb.DeleteAgentResponse:
+        raise NotSupported("this server does not delete agents yet")
+
+    async def GetSubmap(  # noqa: N802
+        self, request: session_pb.GetSubmapRequest, context: Context
+    ) -> session_pb.GetSubmapResponse:
+        session, agent, index = names.parse_submap(request.name)
+        row = await self._store.agents.session(session)
+        stored = await self._store.submaps.stored(row, agent, index)
+        info = await self._store.submaps.info(row, agent, index)
+        return session_pb.GetSubmapResponse(
+            submap=convert.submap_info_to_proto(info),
+            header=submap_pb2.SubmapHeader.FromString(stored.header),
+        )
+
+    async def ListSubmaps(  # noqa: N802
+        self, request: session_pb.ListSubmapsRequest, context: Context
+    ) -> session_pb.ListSubmapsResponse:
+        agent = None
+        if "/agents/" in request.parent:
+            session, agent = names.parse_agent(request.parent, field="parent")
+            await self._store.agents.agent(session, agent)
+        else:
+            session = names.parse_session(request.parent, field="parent")
+        found, following = await self._store.submaps.page(
+            await self._store.agents.session(session),
+            agent=agent,
+            after=page_start(request.page_token),
+            limit=page_limit(request.page_size),
+        )
+        return session_pb.ListSubmapsResponse(
+            submaps=[convert.submap_info_to_proto(info) for info in found],
+            next_page_token=token_of(following),
+        )
+
+    async def DeleteSubmap(  # noqa: N802
+        self, request: session_pb.DeleteSubmapRequest, context: Context
+    ) -> session_pb.DeleteSubmapResponse:
+        raise NotSupported("this server does not delete sub-maps yet")
+
+    async def DownloadSubmap(  # noqa: N802
+        self, request: session_pb.DownloadSubmapRequest, context: Context
+    ) -> AsyncIterator[session_pb.DownloadSubmapResponse]:
+        session, agent, index = names.parse_submap(request.name)
+        row = await self._store.agents.session(session)
+        stored = await self._store.submaps.stored(row, agent, index)
+        loop = asyncio.get_running_loop()
+        parse = submap_pb2.SubmapHeader.FromString
+        header = await loop.run_in_executor(self._threads, parse, stored.header)
+        yield session_pb.DownloadSubmapResponse(header=header)
+        for position, blob in enumerate(header.blobs):
+            async for chunk in file_chunks(
+                self._store.blobs, blob.sha256.hex(), self._threads, blob_index=position
+            ):
+                yield session_pb.DownloadSubmapResponse(chunk=chunk)

@@ -1,0 +1,63 @@
+"""The coordinators of every session of a server."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import Executor
+
+from magic_server.config import ServerConfig
+from magic_server.coordinator import SessionCoordinator
+from magic_server.jobs import JobExecutor
+from magic_server.places import DescriptorIndex
+from magic_server.store import AgentRow, SessionRow, Store, Vertex
+
+
+class Sessions:
+    """One coordinator per session, begun when the server starts or the session does."""
+
+    def __init__(
+        self, store: Store, *, jobs: JobExecutor, threads: Executor, config: ServerConfig
+    ) -> None:
+        self._store = store
+        self._jobs = jobs
+        self._threads = threads
+        self._config = config
+        self._coordinators: dict[str, SessionCoordinator] = {}
+        self._lock = asyncio.Lock()
+
+    async def start(self) -> None:
+        """Take up every stored session."""
+        # Loads the index library now: that would hold up the event loop later.
+        await asyncio.get_running_loop().run_in_executor(self._threads, DescriptorIndex, 1)
+        for session in await self._store.agents.sessions():
+            await self.coordinator(session)
+
+    async def close(self) -> None:
+        """Stop every coordinator."""
+        for coordinator in self._coordinators.values():
+            await coordinator.close()
+
+    async def coordinator(self, session: SessionRow) -> SessionCoordinator:
+        """A session's coordinator; the session must be in the store."""
+        async with self._lock:
+            found = self._coordinators.get(session.name)
+            if found is None:
+                found = SessionCoordinator(
+                    session,
+                    self._store,
+                    jobs=self._jobs,
+                    threads=self._threads,
+                    config=self._config,
+                )
+                await found.start()
+                self._coordinators[session.name] = found
+            return found
+
+    def submap_stored(self, agent: AgentRow, vertex: Vertex) -> None:
+        """Tell the session's coordinator of a sub-map that is durable."""
+        self._coordinators[agent.session.name].submap_stored(vertex)
+
+    async def named(self, session: str) -> SessionCoordinator:
+        """The coordinator of a session's id; NotFound when there is no such session."""
+        found = self._coordinators.get(session)
+        return found or await self.coordinator(await self._store.agents.session(session))
