@@ -66,8 +66,8 @@ def image_pyramid(
 def view_pyramid(view: Float32, *, camera: Camera, levels: int, alpha_power: int) -> Pyramid:
     """The pyramid of a rendered view: (5, h, w) R G B, *accumulated* depth and alpha.
 
-    Colour and depth become expected values (divided by alpha), alpha becomes the soft mask
-    alpha^power (paper, "Pose Refinement").
+    Depth becomes expected depth (divided by alpha); colour stays as rendered, for that is what
+    mapping fits to the images. Alpha becomes the soft mask alpha^power (paper, "Pose Refinement").
     """
     return reference_pyramid(_expected_view(view, alpha_power), camera=camera, levels=levels)
 
@@ -175,8 +175,9 @@ def _expected_view(view, alpha_power):
             alpha = view[4, y, x]
             enough = alpha > _MIN_ALPHA
             scale = one / alpha if enough else np.float32(0.0)
-            for plane in range(4):
-                reference[plane, y, x] = view[plane, y, x] * scale
+            for plane in range(3):
+                reference[plane, y, x] = view[plane, y, x]
+            reference[3, y, x] = view[3, y, x] * scale
             mask = one
             for _ in range(alpha_power):
                 mask *= alpha

@@ -60,7 +60,7 @@ class StepReport:
     ssim: float
     """Mean structural similarity, 1 is equal."""
     depth_l1: float
-    """Mean absolute error of accumulated depth over the pixels with depth, metres."""
+    """Mean over the pixels with depth of alpha times the error of expected depth, metres."""
 
 
 @dataclass(slots=True)

@@ -53,7 +53,7 @@ def torch_losses(image, colour, depth, weight, ssim_share):
     similarity = (2 * mu_x * mu_y + 0.01**2) * a2 / ((mu_x**2 + mu_y**2 + 0.01**2) * b2)
     l1 = (weight * (x - y).abs()).mean()
     valid = torch.tensor(depth > 0)
-    depth_l1 = (weight * (image[3] - torch.tensor(depth)).abs())[valid].mean()
+    depth_l1 = (weight * (image[3] - image[4] * torch.tensor(depth)).abs())[valid].mean()
     total = (1 - ssim_share) * l1 + ssim_share * (weight * (1 - similarity)).mean() + depth_l1
     return total, l1, (weight * similarity).mean(), depth_l1
 
