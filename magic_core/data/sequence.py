@@ -47,6 +47,10 @@ class FileSequence:
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
 
+    def timed_poses(self) -> list[tuple[float, NDArray[np.float64] | None]]:
+        """(timestamp, ground truth) of every frame, without reading any image."""
+        return [(files.timestamp_s, files.world_from_camera) for files in self.files]
+
     def __getitem__(self, index: int) -> Frame:
         """Read frame `index`; IndexError past the end, DataError where a file is unreadable."""
         position = range(len(self.files))[index]

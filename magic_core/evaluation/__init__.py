@@ -1,4 +1,12 @@
-"""Trajectories, errors, image metrics, run folders and reports."""
+"""Trajectories, errors, image metrics, run folders and reports.
+
+What needs images, the map or matplotlib is imported when first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from magic_core.evaluation.ate import ate_rmse, joint_ate_rmse
 from magic_core.evaluation.records import (
@@ -17,6 +25,20 @@ from magic_core.evaluation.trajectory import (
     write_tum,
 )
 
+if TYPE_CHECKING:
+    from magic_core.evaluation.accuracy import ground_truth_of, measure_trajectories
+    from magic_core.evaluation.evaluate import evaluate_run
+    from magic_core.evaluation.image_metrics import depth_l1, psnr, ssim
+
+_HOMES = {
+    "depth_l1": "image_metrics",
+    "evaluate_run": "evaluate",
+    "ground_truth_of": "accuracy",
+    "measure_trajectories": "accuracy",
+    "psnr": "image_metrics",
+    "ssim": "image_metrics",
+}
+
 __all__ = [
     "AgentReport",
     "Components",
@@ -26,9 +48,21 @@ __all__ = [
     "Trajectory",
     "WireBytes",
     "ate_rmse",
+    "depth_l1",
+    "evaluate_run",
+    "ground_truth_of",
     "joint_ate_rmse",
+    "measure_trajectories",
+    "psnr",
     "read_kitti",
     "read_tum",
+    "ssim",
     "write_kitti",
     "write_tum",
 ]
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
