@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import gc
 import logging
+import os
 import sys
 import threading
 import time
@@ -33,7 +34,8 @@ class Stall:
     gap_s: float
     """Time between two heartbeats, less the interval."""
     waited_s: float
-    """Share of it in which a thread of this process waited for a processor (0 where unknown)."""
+    """Share of it in which a thread of this process, or the whole machine, waited for a processor
+    (0 where unknown)."""
     cpu_s: float
     """Processor time the loop's own thread used."""
     gc_s: float
@@ -104,7 +106,8 @@ class LoopMonitor:
 
     def _record(self, gap: float, waits: dict[str, float], cpu: float) -> None:
         now = _waits()
-        waited = max((now[t] - waits.get(t, 0.0) for t in now), default=0.0)
+        passed = {thread: now[thread] - waits.get(thread, 0.0) for thread in now}
+        waited = passed.pop("stolen") + max(passed.values(), default=0.0)
         seconds = max(0.0, gap - waited)
         self.longest_s = max(self.longest_s, seconds)
         if seconds <= self.threshold_s:
@@ -136,4 +139,13 @@ def _waits() -> dict[str, float]:
     for file in Path("/proc/self/task").glob("*/schedstat"):
         with contextlib.suppress(OSError, ValueError, IndexError):
             waits[file.parent.name] = int(file.read_text().split()[1]) * 1e-9
+    waits["stolen"] = _stolen()
     return waits
+
+
+def _stolen() -> float:
+    """Seconds that a hypervisor kept processors from this machine since it started."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        ticks = int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8])
+        return ticks / os.sysconf("SC_CLK_TCK")
+    return 0.0

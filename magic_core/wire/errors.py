@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import grpc
 from google.protobuf import any_pb2
+from google.protobuf.message import DecodeError, Message
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
@@ -58,10 +61,13 @@ def _details(call: grpc.RpcError) -> tuple[str | None, tuple[FieldViolation, ...
     status = _rich_status(call)
     for detail in status.details if status is not None else ():
         info, bad = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
-        if detail.Unpack(info) and info.domain == DOMAIN:
-            reason = info.reason
-        elif detail.Unpack(bad):
-            violations = tuple(FieldViolation(v.field, v.description) for v in bad.field_violations)
+        with contextlib.suppress(DecodeError):
+            if detail.Unpack(info) and info.domain == DOMAIN:
+                reason = info.reason
+            elif detail.Unpack(bad):
+                violations = tuple(
+                    FieldViolation(v.field, v.description) for v in bad.field_violations
+                )
     return reason, violations
 
 
@@ -71,12 +77,12 @@ def _rich_status(call: grpc.RpcError) -> status_pb2.Status | None:
         if key == "grpc-status-details-bin":
             try:
                 return status_pb2.Status.FromString(value)
-            except ValueError:
+            except DecodeError:
                 return None
     return None
 
 
-def _packed(message) -> any_pb2.Any:
+def _packed(message: Message) -> any_pb2.Any:
     packed = any_pb2.Any()
     packed.Pack(message)
     return packed

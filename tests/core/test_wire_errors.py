@@ -1,0 +1,73 @@
+"""Errors cross the wire as the class that was raised."""
+
+from __future__ import annotations
+
+import grpc
+import pytest
+from grpc_status import rpc_status
+
+from magic_core import errors
+from magic_core.errors import FieldViolation, MagicError
+from magic_core.wire import error_of, grpc_status_of, status_of
+
+
+class FailedCall(grpc.RpcError):
+    """A call that ended with a status, as a client sees it."""
+
+    def __init__(self, code, details, metadata) -> None:
+        self._answer = code, details, metadata
+
+    def code(self):
+        return self._answer[0]
+
+    def details(self):
+        return self._answer[1]
+
+    def trailing_metadata(self):
+        return self._answer[2]
+
+
+def all_classes(kind: type[MagicError] = MagicError) -> list[type[MagicError]]:
+    return [kind, *(c for sub in kind.__subclasses__() for c in all_classes(sub))]
+
+
+@pytest.mark.parametrize("kind", all_classes())
+def test_every_error_comes_back_as_itself(kind: type[MagicError]) -> None:
+    violations = (FieldViolation("camera.fx", "must be > 0"), FieldViolation("depth", "is NaN"))
+    raised = kind("the message", violations=violations)
+    status = grpc_status_of(raised)
+    assert status.code.name == kind.grpc_code
+    caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
+    assert type(caught) is kind
+    assert (caught.message, caught.violations) == (raised.message, violations)
+
+
+def test_a_status_reads_as_google_rpc_status() -> None:
+    error = errors.InvalidInput.field("odometry", "is bent")
+    parsed = rpc_status.from_call(FailedCall(*grpc_status_of(error)[:3]))  # type: ignore[arg-type]
+    assert parsed == status_of(error)
+    assert [detail.type_url.rpartition(".")[2] for detail in parsed.details] == [
+        "ErrorInfo",
+        "BadRequest",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (grpc.StatusCode.UNAVAILABLE, errors.Unavailable),
+        (grpc.StatusCode.DEADLINE_EXCEEDED, errors.DeadlineExceeded),
+        (grpc.StatusCode.UNIMPLEMENTED, errors.NotSupported),
+        (grpc.StatusCode.INTERNAL, MagicError),
+    ],
+)
+def test_a_bare_status_goes_by_its_code(code: grpc.StatusCode, kind: type[MagicError]) -> None:
+    caught = error_of(FailedCall(code, "text", ()))
+    assert type(caught) is kind
+    assert "text" in caught.message
+
+
+def test_damaged_details_do_not_hide_the_code() -> None:
+    metadata = (("grpc-status-details-bin", b"\xff\xff\xff"),)
+    caught = error_of(FailedCall(grpc.StatusCode.NOT_FOUND, "text", metadata))
+    assert type(caught) is errors.NotFound
