@@ -37,9 +37,9 @@ class MappingConfig:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     keyframe_every: int = 0
     """Fixed keyframe interval in frames; 0 chooses keyframes by novelty."""
-    iterations: int = 24
+    iterations: int = 14
     """Optimisation steps per keyframe."""
-    anchor_iterations: int = 32
+    anchor_iterations: int = 28
     """Optimisation steps on the first keyframe of a sub-map."""
     settle: float = 0.01
     """Stop early when an iteration gains less than this share of the loss; 0 never stops early."""

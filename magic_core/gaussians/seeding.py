@@ -47,7 +47,7 @@ class BlockRule:
     """Largest root mean square deviation from the block's mean colour; colours span 0 to 1."""
     normal_agreement: float = 0.97
     """Least length of the mean of the block's unit normals."""
-    depth_deviation: float = 0.01
+    depth_deviation: float = 0.005
     """Largest relative standard deviation of inverse depth: a Gaussian is rendered at one depth."""
 
 
@@ -75,7 +75,8 @@ def seed_adaptive(
 ) -> GaussianCloud:
     """Flat Gaussians, in the camera frame, that cover the reliable pixels in need.
 
-    At most `limit` are made: the colour tolerance is doubled until they fit.
+    At most `limit` are made: the colour tolerance is doubled until they fit, and where even that
+    does not do, seeds are left out evenly.
     """
     wanted = need & surface.reliable & (np.abs(surface.normals).sum(axis=-1) > 0)
     tolerance = rule.colour_deviation
@@ -83,7 +84,8 @@ def seed_adaptive(
     while len(blocks.sides) > limit and tolerance < 1.0:
         tolerance *= 2.0
         blocks = _quadtree(colour, depth, surface.normals, wanted, rule, tolerance)
-    return _flat_gaussians(blocks, camera, shape).select(np.arange(min(limit, len(blocks.sides))))
+    kept = np.linspace(0, len(blocks.sides) - 1, min(limit, len(blocks.sides))).astype(np.int64)
+    return _flat_gaussians(blocks, camera, shape).select(kept)
 
 
 def seed_uniform(
