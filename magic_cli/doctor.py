@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import shutil
 import socket
@@ -140,7 +141,7 @@ def _memory() -> Check:
 def _port() -> Check:
     from magic_server.config import ServerConfig
 
-    port = ServerConfig().port
+    port = ServerConfig().listen.port
     with socket.socket() as probe:
         taken = probe.connect_ex(("127.0.0.1", port)) == 0
     if taken:

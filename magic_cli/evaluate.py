@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from magic_cli.options import parse
-from magic_cli.output import console, print_json
+from magic_cli.output import print_json
 from magic_core.errors import DataError
 
 
@@ -29,12 +29,12 @@ class EvalConfig:
 def main(arguments: list[str]) -> int:
     """Evaluate, rewrite metrics.json, print the table."""
     config = parse(EvalConfig, arguments, prog="magic eval", description=__doc__ or "")
-    from magic_cli.evaluation import write_report
+    from magic_cli.evaluation import measure_again, write_report
     from magic_cli.run import RunConfig
     from magic_cli.summary import print_summary
     from magic_core.config import load_yaml
     from magic_core.data import open_dataset
-    from magic_core.evaluation import RunFolder, evaluate_run
+    from magic_core.evaluation import RunFolder
 
     folder = RunFolder(config.run)
     if not folder.config_path.is_file():
@@ -43,10 +43,7 @@ def main(arguments: list[str]) -> int:
     sources = open_dataset(
         config.dataset or run.dataset, scale=run.scale, max_frames=run.frames, stride=run.stride
     )
-    metrics = folder.read_metrics()
-    with console.status("measuring the map and the trajectories"):
-        metrics |= evaluate_run(folder, sources=sources)
-    folder.write_metrics(metrics)
+    metrics = measure_again(folder, sources)
     if config.report:
         write_report(folder, sources)
     print_summary(metrics, folder)

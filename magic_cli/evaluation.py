@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from magic_cli.local_run import Outcome
 
 
+TIMED_BY_THE_RUN = ("fps", "agents", "merge_s", "gaussians", "wall_s")
+
+
 def measure(
     folder: RunFolder,
     sources: list[FrameSource],
@@ -27,20 +30,45 @@ def measure(
     started: float,
 ) -> dict:
     """Evaluate a finished run, write metrics.json and the report, return the metrics."""
-    from magic_core.evaluation import evaluate_run
-
-    with console.status("measuring the map and the trajectories"):
-        metrics = evaluate_run(folder, sources=sources)
-    metrics |= agent_metrics(agent_reports(folder), outcome.mapping_s)
-    metrics["loops"] = loop_counts(folder.read_loops())
-    metrics["agents"] = dict(sorted(outcome.agents.items()))
-    metrics["merge_s"] = round(outcome.merge_s, 2)
-    metrics["gaussians"] = outcome.gaussians
-    metrics["wall_s"] = round(time.perf_counter() - started, 2)
+    metrics = {
+        **_measured(folder, sources),
+        "fps": _rate(folder, outcome.mapping_s),
+        "agents": dict(sorted(outcome.agents.items())),
+        "merge_s": round(outcome.merge_s, 2),
+        "gaussians": outcome.gaussians,
+        "wall_s": round(time.perf_counter() - started, 2),
+    }
     folder.write_metrics(metrics)
     if report:
         write_report(folder, sources)
     return metrics
+
+
+def measure_again(folder: RunFolder, sources: list[FrameSource]) -> dict:
+    """Measure a finished run anew; what only the run itself could time is kept as it was."""
+    try:
+        before = folder.read_metrics()
+    except NotFound:  # the run was cut short before it was measured
+        before = {}
+    unknown: dict[str, Any] = dict.fromkeys(TIMED_BY_THE_RUN)
+    metrics = unknown | before | _measured(folder, sources)
+    folder.write_metrics(metrics)
+    return metrics
+
+
+def _measured(folder: RunFolder, sources: list[FrameSource]) -> dict:
+    from magic_core.evaluation import evaluate_run
+
+    with console.status("measuring the map and the trajectories"):
+        accuracy = evaluate_run(folder, sources=sources)
+    reports = agent_reports(folder)
+    return {**accuracy, **agent_metrics(reports), "loops": loop_counts(folder.read_loops())}
+
+
+def _rate(folder: RunFolder, mapping_s: float) -> float | None:
+    """Frames per second of all agents together."""
+    frames = sum(report.frames for report in agent_reports(folder))
+    return round(frames / mapping_s, 2) if mapping_s else None
 
 
 def write_report(folder: RunFolder, sources: list[FrameSource]) -> None:
@@ -62,19 +90,17 @@ def agent_reports(folder: RunFolder) -> list[AgentReport]:
     return reports
 
 
-def agent_metrics(reports: list[AgentReport], mapping_s: float) -> dict:
+def agent_metrics(reports: list[AgentReport]) -> dict:
     """Counts, times per frame and bytes of all agents together."""
-    frames = sum(report.frames for report in reports)
     tracking = [ms for report in reports for ms in report.tracking_ms]
     mapping = [ms for report in reports for ms in report.mapping_ms]
     sizes = [size for report in reports for size in report.wire_bytes]
     return {
-        "frames": frames,
+        "frames": sum(report.frames for report in reports),
         "lost_frames": sum(report.lost_frames for report in reports),
         "submaps": sum(report.submaps for report in reports),
         "tracking_ms": spread(tracking),
         "mapping_ms": spread(mapping),
-        "fps": round(frames / mapping_s, 2) if mapping_s else None,
         "wire_bytes_per_submap": {
             kind: round(statistics.fmean(getattr(size, kind) for size in sizes)) if sizes else None
             for kind in ("compact", "lossless")

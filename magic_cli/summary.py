@@ -17,8 +17,11 @@ def print_summary(metrics: dict, folder: RunFolder) -> None:
 
 def _accuracy(metrics: dict):
     ate = metrics.get("ate_rmse_m") or {}
-    rows = [[name, _number(value, 100, " cm")] for name, value in ate.items()]
-    return table("Trajectory error (ATE RMSE)", ["agent", "error"], rows)
+    tracked = metrics.get("ate_tracked_rmse_m") or {}
+    rows = [
+        [name, _centimetres(tracked.get(name)), _centimetres(value)] for name, value in ate.items()
+    ]
+    return table("Trajectory error, ATE RMSE", ["agent", "odometry alone", "corrected"], rows)
 
 
 def _facts(metrics: dict) -> list[list[str]]:
@@ -37,17 +40,21 @@ def _facts(metrics: dict) -> list[list[str]]:
                                               f"{_number(depth.get('novel'), 100, ' cm')}"],
         ["tracking / mapping per frame", f"{metrics['tracking_ms']['median']} / "
                                          f"{metrics['mapping_ms']['median']} ms (median)"],
-        ["all agents together", f"{metrics['fps']} frames/s"],
+        ["all agents together", _number(metrics["fps"], 1, " frames/s")],
         ["sub-map on the wire", f"{_megabytes(wire['compact'])} "
                                 f"(lossless {_megabytes(wire['lossless'])})"],
-        ["Gaussians", f"{metrics['gaussians']:,}"],
-        ["merge", f"{metrics['merge_s']} s"],
-        ["whole run", f"{metrics['wall_s']} s"],
+        ["Gaussians", "-" if metrics["gaussians"] is None else f"{metrics['gaussians']:,}"],
+        ["merge", _number(metrics["merge_s"], 1, " s")],
+        ["whole run", _number(metrics["wall_s"], 1, " s")],
     ]  # fmt: skip
 
 
 def _number(value: float | None, factor: float, unit: str) -> str:
-    return "-" if value is None else f"{value * factor:.2f}{unit}"
+    return "-" if value is None else f"{value * factor:.1f}{unit}"
+
+
+def _centimetres(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2f} cm"
 
 
 def _megabytes(count: float | None) -> str:

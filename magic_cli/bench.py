@@ -1,0 +1,29 @@
+"""`magic bench NAME`: benchmarks; each prints medians and ratios, `--json` one JSON object.
+
+magic bench render [--against PROTOTYPE]   forward and backward of the rasteriser
+magic bench track DATASET                  accuracy and speed of tracking, solver by solver
+magic bench loops DATASET...               precision and recall of loop detection and verification
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+BENCHMARKS = {
+    "render": "magic_cli.benchmarks.render",
+    "track": "magic_cli.benchmarks.track",
+    "loops": "magic_cli.benchmarks.loops",
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Run one benchmark by name."""
+    if arguments[:1] in (["-h"], ["--help"]):
+        print(f"usage: magic bench {{{','.join(BENCHMARKS)}}} [options]\n\n{__doc__}")
+        return 0
+    if not arguments or arguments[0] not in BENCHMARKS:
+        names = ", ".join(BENCHMARKS)
+        print(f"magic bench: expected one of {names}", file=sys.stderr)
+        return 2
+    return importlib.import_module(BENCHMARKS[arguments[0]]).main(arguments[1:])

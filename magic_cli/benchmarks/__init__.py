@@ -1,0 +1,1 @@
+"""Command lines of the benchmarks; what they measure lives with what is measured."""
