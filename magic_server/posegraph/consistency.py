@@ -6,8 +6,13 @@ mates if the cycle misses identity by no more than loops and odometry explain.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from magic_server.posegraph import stacked
 from magic_server.posegraph.arrays import EdgeArrays
@@ -15,52 +20,133 @@ from magic_server.posegraph.chains import Chains
 
 Array = NDArray[np.float64]
 
+NEIGHBOURS = 16
+NEIGHBOUR_STEPS = 30
 MATE_CHI_SQUARE = 16.81
 """99 % quantile of a chi-square with 6 degrees of freedom."""
 
 
-def mates(loops: EdgeArrays, chains: Chains, *, slack: float = 1.0) -> NDArray[np.bool_]:
-    """(m, m): which loops are consistent; all must join the same two chains, in one direction."""
+def mates(loops: EdgeArrays, chains: Chains, *, scale: float = 1.0) -> NDArray[np.bool_]:
+    """(m, m): which loops are consistent; all must join the same two chains, in one direction.
+
+    `scale` widens all standard deviations.
+    """
     count = len(loops)
-    found = np.zeros((count, count), dtype=bool)
-    loop_m2, loop_rad2 = loops.variances()
-    votes_inverse = stacked.inverse(votes(loops, chains))
-    target_inverse = stacked.inverse(chains.poses[loops.target])
-    for k in range(count):
-        # What every other loop says where loop k measured: identity if they agree.
-        left = loops.source_from_target[k] @ target_inverse[k]
-        missed = left @ votes_inverse @ chains.poses[loops.source[k]]
-        distance_m = np.maximum(
-            _distances(chains.poses, loops.source[k], loops.source),
-            _distances(chains.poses, loops.target[k], loops.target),
-        )
-        drift_m2, drift_rad2 = _drift(chains, loops, k)
-        variance_rad2 = drift_rad2 + loop_rad2[k] + loop_rad2
-        lever_rad2 = drift_rad2 / 3.0 + loop_rad2
-        variance_m2 = drift_m2 + loop_m2[k] + loop_m2 + lever_rad2 * distance_m**2
-        miss = (missed[:, :3, 3] ** 2).sum(axis=1) / variance_m2
-        miss += stacked.rotation_angles(missed) ** 2 / variance_rad2
-        found[k] = miss < MATE_CHI_SQUARE * slack**2
+    first, second = np.divmod(np.arange(count * count), max(count, 1))
+    agree = _Cycles(loops, chains).miss(first, second) < MATE_CHI_SQUARE * scale**2
+    found = agree.reshape(count, count)
     found = found | found.T
     np.fill_diagonal(found, False)
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSupport:
+    """What the nearest loops, in steps along both chains, say about each of m loops."""
+
+    asked: NDArray[np.int64]  # (m,) how many neighbours there are
+    agreeing: NDArray[np.int64]  # (m,) how many of them are consistent with the loop
+    cluster_size: NDArray[np.int64]  # (m,) loops that agree with it directly or through others
+
+
+def local_support(loops: EdgeArrays, chains: Chains, *, scale: float = 1.0) -> LocalSupport:
+    """Ask every loop's neighbours; `scale` widens all standard deviations.
+
+    Two wrong loops agree by chance only rarely, right ones nearly always: a loop that disagrees
+    with its neighbours is suspect. Wrong loops of one mistaken place agree with each other, but
+    right ones usually form the larger clusters.
+    """
+    count = len(loops)
+    if count < 2:
+        zero = np.zeros(count, np.int64)
+        return LocalSupport(zero, zero, np.ones(count, np.int64))
+    oriented = oriented_by_age(loops, chains)
+    first, second = _neighbours(oriented, chains)
+    agree = _Cycles(oriented, chains).miss(first, second) < MATE_CHI_SQUARE * scale**2
+    asked = np.bincount(first, minlength=count) + np.bincount(second, minlength=count)
+    first, second = first[agree], second[agree]
+    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    return LocalSupport(
+        asked=asked,
+        agreeing=np.bincount(first, minlength=count) + np.bincount(second, minlength=count),
+        cluster_size=np.bincount(label)[label],
+    )
+
+
+def _neighbours(loops: EdgeArrays, chains: Chains) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of loops whose ends are within NEIGHBOUR_STEPS of each other, the nearest ones."""
+    count = len(loops)
+    # Chains lie so far apart that loops of other pairs of chains are never neighbours.
+    place = chains.step + chains.chain * (len(chains.chain) + 2 * NEIGHBOUR_STEPS)
+    ends = np.stack([place[loops.source], place[loops.target]], axis=1)
+    distance, other = cKDTree(ends).query(
+        ends, k=min(NEIGHBOURS + 1, count), p=np.inf, distance_upper_bound=NEIGHBOUR_STEPS
+    )
+    first, column = np.nonzero(np.isfinite(distance) & (other != np.arange(count)[:, None]))
+    return first, other[first, column]
+
+
+class _Cycles:
+    """Cycles of two loops and the odometry between their ends."""
+
+    def __init__(self, loops: EdgeArrays, chains: Chains) -> None:
+        self.loops, self.chains = loops, chains
+        self.variance_m2, self.variance_rad2 = loops.variances()
+        self.votes_inverse = stacked.inverse(votes(loops, chains))
+        target_inverse = stacked.inverse(chains.poses[loops.target])
+        self.left = loops.source_from_target @ target_inverse
+        self.right = chains.poses[loops.source]
+
+    def miss(self, k: NDArray[np.int64], other: NDArray[np.int64]) -> Array:
+        """Squared Mahalanobis norms of the cycles of loops k and other, index arrays alike."""
+        # What the other loop says where loop k measured: identity if they agree.
+        missed = self.left[k] @ self.votes_inverse[other] @ self.right[k]
+        ends = self.loops.source, self.loops.target
+        positions = self.chains.poses[:, :3, 3]
+        distance_m = np.max(
+            [np.linalg.norm(positions[end[k]] - positions[end[other]], axis=1) for end in ends],
+            axis=0,
+        )
+        drift_m2 = self._drift(self.chains.drift_m2, self.chains.reach_m2, k, other)
+        drift_rad2 = self._drift(self.chains.drift_rad2, self.chains.reach_rad2, k, other)
+        lever_rad2 = drift_rad2 / 3.0 + self.variance_rad2[other]
+        spread_m2 = drift_m2 + self.variance_m2[k] + self.variance_m2[other]
+        spread_m2 = spread_m2 + lever_rad2 * distance_m**2
+        spread_rad2 = drift_rad2 + self.variance_rad2[k] + self.variance_rad2[other]
+        miss = (missed[:, :3, 3] ** 2).sum(axis=1) / spread_m2
+        return miss + stacked.rotation_angles(missed) ** 2 / spread_rad2
+
+    def _drift(
+        self, drift: Array, reach: Array, k: NDArray[np.int64], other: NDArray[np.int64]
+    ) -> Array:
+        """Variance between the ends of two loops: along odometry, or by way of the start."""
+        total = np.zeros(len(k))
+        for end in (self.loops.source, self.loops.target):
+            along = np.abs(drift[end[k]] - drift[end[other]])
+            total += np.minimum(along, reach[end[k]] + reach[end[other]])
+        return total
+
+
+def oriented_by_age(loops: EdgeArrays, chains: Chains) -> EdgeArrays:
+    """The loops with the older chain (within one chain: the older vertex) as source."""
+    a, b = chains.chain[loops.source], chains.chain[loops.target]
+    turn = (a > b) | ((a == b) & (loops.source > loops.target))
+    if not turn.any():
+        return loops
+    # The variances are about equal at both ends: the information keeps its frame.
+    matrices = np.where(
+        turn[:, None, None], stacked.inverse(loops.source_from_target), loops.source_from_target
+    )
+    return EdgeArrays(
+        source=np.where(turn, loops.target, loops.source),
+        target=np.where(turn, loops.source, loops.target),
+        source_from_target=matrices,
+        information=loops.information,
+    )
 
 
 def votes(loops: EdgeArrays, chains: Chains) -> Array:
     """(m, 4, 4): what each loop says about source_chain_from_target_chain."""
     target_inverse = stacked.inverse(chains.poses[loops.target])
     return chains.poses[loops.source] @ loops.source_from_target @ target_inverse
-
-
-def _distances(poses: Array, one: int, others: NDArray[np.int64]) -> Array:
-    return np.linalg.norm(poses[others, :3, 3] - poses[one, :3, 3], axis=1)
-
-
-def _drift(chains: Chains, loops: EdgeArrays, k: int) -> tuple[Array, Array]:
-    """Odometry's variance between the ends of loop k and those of every loop."""
-    drift = []
-    for accumulated in (chains.drift_m2, chains.drift_rad2):
-        at_source = np.abs(accumulated[loops.source] - accumulated[loops.source[k]])
-        at_target = np.abs(accumulated[loops.target] - accumulated[loops.target[k]])
-        drift.append(at_source + at_target)
-    return drift[0], drift[1]

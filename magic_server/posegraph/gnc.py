@@ -1,7 +1,8 @@
 """Graduated non-convexity with truncated least squares (Yang et al. 2020) over GTSAM.
 
 Odometry is trusted; loops get weights in [0, 1]. Loops with no weight are *left out* of the
-linear system: with zero-weight factors in it, GTSAM's own GncLMOptimizer fills in and takes minutes.
+linear system: with zero-weight factors in it, GTSAM's own GncLMOptimizer fills in and takes
+minutes.
 """
 
 from __future__ import annotations
@@ -9,21 +10,31 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph.arrays import EdgeArrays
-from magic_server.posegraph.optimiser import FactorCache, anchored, optimise
+from magic_server.posegraph.optimiser import (
+    FactorCache,
+    anchored,
+    chordal_start,
+    optimise,
+    values_of,
+)
 
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-STEP = 1.4
-MAX_ROUNDS = 60
+STEP = 2.0
+LEAST_MU = 0.004
+"""Annealing starts no wider than loops 16 times beyond their bound: the start is placed already."""
+MAX_ROUNDS = 30
 ITERATIONS_PER_ROUND = 2
 LEAST_WEIGHT = 1e-3
 POLISH_ROUNDS = 5
+SEED_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,29 +59,44 @@ class RobustGraph:
 
     def solve(self, poses: Array, weights: Array, *, max_iterations: int) -> Array:
         """Optimise with the loops' weights (m,); weights below LEAST_WEIGHT are dropped."""
+        return optimise(self._weighted(weights), poses, max_iterations=max_iterations)
+
+    def _weighted(self, weights: Array) -> gtsam.NonlinearFactorGraph:
         graph = self._base.clone()
         for index in np.flatnonzero(weights > LEAST_WEIGHT).tolist():
             graph.add(self._loop_factors.factor(index, float(weights[index])))
-        return optimise(graph, poses, max_iterations=max_iterations)
+        return graph
 
-    def truncated_cost(self, poses: Array, limit: float) -> float:
-        """Half the sum of odometry's squared norms and of the loops', cut at `limit` each."""
-        loops = np.minimum(self.loops.squared_norms(poses), limit)
-        return 0.5 * float(self.odometry.squared_norms(poses).sum() + loops.sum())
+    def best_start(self, poses: Array, weights: Array) -> Array:
+        """The given poses, or chordal initialisation where that is possible and starts lower."""
+        graph = self._weighted(weights)
+        chordal = chordal_start(graph, len(poses))
+        if chordal is None:
+            return poses
+        errors = [graph.error(values_of(start)) for start in (poses, chordal)]
+        return chordal if np.isfinite(errors[1]) and errors[1] < errors[0] else poses
 
 
 def graduated(
-    graph: RobustGraph, poses: Array, *, limit: float, candidates: NDArray[np.bool_] | None = None
+    graph: RobustGraph,
+    poses: Array,
+    *,
+    limit: float,
+    seed: NDArray[np.bool_] | None,
+    candidates: NDArray[np.bool_] | None = None,
 ) -> GncResult:
     """Anneal from nearly convex to truncated least squares; `limit` is the chi-square bound.
 
-    `candidates` keeps the annealing to some loops; the polish may take up the others.
+    `seed` are loops to solve with first. `candidates` keeps the annealing to some loops; the
+    polish may take up the others.
     """
     allowed = np.ones(len(graph.loops), bool) if candidates is None else candidates
+    if seed is not None:
+        poses = graph.solve(poses, seed.astype(float), max_iterations=SEED_ITERATIONS)
     squared = graph.loops.squared_norms(poses)
     largest = float(squared[allowed].max(initial=0.0))
     if largest > limit:
-        mu = limit / max(2.0 * largest - limit, 1e-9)
+        mu = max(limit / max(2.0 * largest - limit, 1e-9), LEAST_MU)
         for _ in range(MAX_ROUNDS):
             weights = np.where(allowed, _weights(squared, mu, limit), 0.0)
             poses = graph.solve(poses, weights, max_iterations=ITERATIONS_PER_ROUND)

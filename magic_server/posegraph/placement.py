@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magic_server.posegraph import stacked
 from magic_server.posegraph.arrays import EdgeArrays
 from magic_server.posegraph.chains import Chains
-from magic_server.posegraph.consistency import mates, votes
+from magic_server.posegraph.consistency import mates, oriented_by_age, votes
 
 Array = NDArray[np.float64]
 
@@ -32,11 +32,11 @@ class Consensus:
 
 
 def consensus_of_pair(
-    loops: EdgeArrays, chains: Chains, *, weights: Array | None = None
+    loops: EdgeArrays, chains: Chains, *, weights: Array | None = None, scale: float = 1.0
 ) -> Consensus:
     """The best supported vote among loops that join one pair of chains."""
-    oriented = _oriented(loops, chains)
-    agreeing = mates(oriented, chains)
+    oriented = oriented_by_age(loops, chains)
+    agreeing = mates(oriented, chains, scale=scale)
     weight = np.ones(len(loops)) if weights is None else weights
     support = weight * (1.0 + agreeing @ weight)
     best = int(support.argmax())
@@ -49,14 +49,19 @@ def consensus_of_pair(
 
 
 def place(
-    chains: Chains, loops: EdgeArrays, known: Mapping[int, Array], *, weights: Array | None = None
+    chains: Chains,
+    loops: EdgeArrays,
+    known: Mapping[int, Array],
+    *,
+    weights: Array | None = None,
+    scale: float = 1.0,
 ) -> Array:
     """Poses (n, 4, 4) of all vertices: each chain moved rigidly to where the loops place it.
 
     `known` holds `world_from_chain` of chains with a known start; without any, the oldest chain
     defines the world. Chains that no loop reaches stay at identity.
     """
-    consensus = _all_pairs(chains, loops, weights)
+    consensus = _all_pairs(chains, loops, weights, scale)
     world_from_chain = dict(known) or {chains.oldest[0]: np.eye(4)}
     for pair in _strongest_first(consensus, world_from_chain, chains):
         if pair.second in world_from_chain:
@@ -69,14 +74,27 @@ def place(
     return frames @ chains.poses
 
 
-def _all_pairs(chains: Chains, loops: EdgeArrays, weights: Array | None) -> list[Consensus]:
+def known_frames(chains: Chains, priors: Mapping[int, Array]) -> dict[int, Array]:
+    """world_from_chain of the chains that have a vertex with a prior; the oldest one counts."""
+    known: dict[int, Array] = {}
+    for vertex in sorted(priors):
+        chain = int(chains.chain[vertex])
+        known.setdefault(chain, priors[vertex] @ _inverse(chains.poses[vertex]))
+    return known
+
+
+def _all_pairs(
+    chains: Chains, loops: EdgeArrays, weights: Array | None, scale: float
+) -> list[Consensus]:
     a, b = chains.chain[loops.source], chains.chain[loops.target]
     low, high = np.minimum(a, b), np.maximum(a, b)
     found = []
-    for first, second in sorted({(x, y) for x, y in zip(low.tolist(), high.tolist()) if x != y}):
+    for first, second in sorted(
+        {(x, y) for x, y in zip(low.tolist(), high.tolist(), strict=True) if x != y}
+    ):
         index = np.flatnonzero((low == first) & (high == second))
         chosen = None if weights is None else weights[index]
-        found.append(consensus_of_pair(loops.select(index), chains, weights=chosen))
+        found.append(consensus_of_pair(loops.select(index), chains, weights=chosen, scale=scale))
     return found
 
 
@@ -96,24 +114,6 @@ def _strongest_first(
         best = max(reachable, key=lambda c: (c.support, -c.first, -c.second))
         inside |= {best.first, best.second}
         tree.append(best)
-
-
-def _oriented(loops: EdgeArrays, chains: Chains) -> EdgeArrays:
-    """The loops with the older chain (within one chain: the older vertex) as source."""
-    a, b = chains.chain[loops.source], chains.chain[loops.target]
-    turn = (a > b) | ((a == b) & (loops.source > loops.target))
-    if not turn.any():
-        return loops
-    # The variances are about equal at both ends: the information keeps its frame.
-    matrices = np.where(
-        turn[:, None, None], stacked.inverse(loops.source_from_target), loops.source_from_target
-    )
-    return EdgeArrays(
-        source=np.where(turn, loops.target, loops.source),
-        target=np.where(turn, loops.source, loops.target),
-        source_from_target=matrices,
-        information=loops.information,
-    )
 
 
 def _inverse(transform: Array) -> Array:

@@ -6,18 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from magic_server.posegraph import stacked
 from magic_server.posegraph.arrays import EdgeArrays, connected_sets
 from magic_server.posegraph.chains import Chains, follow
-from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated
-from magic_server.posegraph.placement import place
-from magic_server.posegraph.problem import (
-    PoseGraphConfig,
-    PoseGraphProblem,
-    PoseGraphSolution,
-)
+from magic_server.posegraph.gnc import GncResult, RobustGraph
+from magic_server.posegraph.placement import known_frames, place
+from magic_server.posegraph.problem import PoseGraphConfig, PoseGraphProblem, PoseGraphSolution
+from magic_server.posegraph.robust import RobustSolver
 
 Array = NDArray[np.float64]
 
@@ -34,15 +30,20 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
     loops = EdgeArrays.of(problem.loops, number)
     priors = {number[name]: pose for name, pose in problem.priors.items()}
     poses = np.tile(np.eye(4), (count, 1, 1))
-    before = np.zeros(0)
     kept = np.zeros(len(loops), dtype=bool)
     start = poses.copy()
     for members, component_priors in _components(count, odometry, loops, priors):
-        part = _Part(members, odometry, loops, component_priors, problem, config)
-        start[members] = part.start
-        result = part.solve()
+        new_number = np.full(count, -1, dtype=np.int64)
+        new_number[members] = np.arange(len(members))
+        inside = np.flatnonzero(new_number[loops.source] >= 0)
+        part_odometry = odometry.select(new_number[odometry.source] >= 0).renumbered(new_number)
+        part_loops = loops.select(inside).renumbered(new_number)
+        part_priors = {int(new_number[v]): pose for v, pose in component_priors.items()}
+        chains = follow(len(members), part_odometry)
+        start[members] = place(chains, part_loops, known_frames(chains, part_priors))
+        result = _solve_part(part_odometry, part_loops, chains, part_priors, start[members], config)
         poses[members] = result.poses
-        kept[part.loop_index] = result.kept
+        kept[inside] = result.kept
     used = loops.select(kept)
     component = connected_sets(count, odometry, used, _joined_by_priors(priors))
     poses, start = _own_gauge(poses, component, priors), _own_gauge(start, component, priors)
@@ -59,49 +60,24 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
     )
 
 
-class _Part:
-    """One connected set of vertices, renumbered from 0."""
-
-    def __init__(
-        self,
-        members: NDArray[np.int64],
-        odometry: EdgeArrays,
-        loops: EdgeArrays,
-        priors: Mapping[int, Array],
-        problem: PoseGraphProblem,
-        config: PoseGraphConfig,
-    ) -> None:
-        new_number = np.full(len(problem.vertices), -1, dtype=np.int64)
-        new_number[members] = np.arange(len(members))
-        self.count = len(members)
-        self.config = config
-        self.loop_index = np.flatnonzero(new_number[loops.source] >= 0)
-        self.loops = loops.select(self.loop_index).renumbered(new_number)
-        inside = new_number[odometry.source] >= 0
-        self.odometry = odometry.select(inside).renumbered(new_number)
-        self.priors = {int(new_number[vertex]): pose for vertex, pose in priors.items()}
-        self.limit = float(chi2.ppf(config.inlier_probability, 6))
-        self.chains = follow(self.count, self.odometry)
-        self.start = self._placed(self.chains)
-
-    def solve(self) -> GncResult:
-        anchors = self.priors or {0: self.start[0]}
-        if not len(self.loops):
-            return GncResult(self.start, np.zeros(0, dtype=bool))
-        graph = RobustGraph(self.odometry, self.loops, anchors)
-        if self.config.robust == "none":
-            weights = np.ones(len(self.loops))
-            iterations = self.config.max_iterations
-            poses = graph.solve(self.start, weights, max_iterations=iterations)
-            return GncResult(poses, weights > 0)
-        return graduated(graph, self.start, limit=self.limit)
-
-    def _placed(self, chains: Chains) -> Array:
-        known = {}
-        for vertex, pose in self.priors.items():
-            chain = int(chains.chain[vertex])
-            known.setdefault(chain, pose @ stacked.inverse(chains.poses[vertex][None])[0])
-        return place(chains, self.loops, known)
+def _solve_part(
+    odometry: EdgeArrays,
+    loops: EdgeArrays,
+    chains: Chains,
+    priors: Mapping[int, Array],
+    start: Array,
+    config: PoseGraphConfig,
+) -> GncResult:
+    """Poses of one connected set of vertices, numbered from 0."""
+    if not len(loops):
+        return GncResult(start, np.zeros(0, dtype=bool))
+    graph = RobustGraph(odometry, loops, priors or {0: start[0]})
+    if config.robust == "gnc":
+        return RobustSolver(graph, chains, priors, config).solve()
+    weights = np.ones(len(loops))
+    start = graph.best_start(start, weights)
+    poses = graph.solve(start, weights, max_iterations=config.max_iterations)
+    return GncResult(poses, weights > 0)
 
 
 def _components(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,8 +27,8 @@ class CoarseMethod(Protocol):
 
     def propose(
         self, source: PreparedView, target: PreparedView, config: RegistrationConfig
-    ) -> list[Hypothesis]:
-        """Hypotheses, best first; none where the method fails."""
+    ) -> Iterator[Hypothesis]:
+        """Hypotheses, likely ones first, computed as they are asked for."""
         ...
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,11 @@ class FpfhRansac:
 
     def propose(
         self, source: PreparedView, target: PreparedView, config: RegistrationConfig
-    ) -> list[Hypothesis]:
+    ) -> Iterator[Hypothesis]:
         source_cloud, source_features = _features(source)
         target_cloud, target_features = _features(target)
         if min(len(source_cloud.points), len(target_cloud.points)) < LEAST_POINTS:
-            return []
+            return
         o3d.utility.random.seed(config.seed)
         result = registration.registration_ransac_based_on_feature_matching(
             source_cloud,
@@ -46,9 +47,8 @@ class FpfhRansac:
             registration.RANSACConvergenceCriteria(ITERATIONS, CONFIDENCE),
         )
         inliers = len(result.correspondence_set)
-        if not inliers:
-            return []
-        return [Hypothesis(np.array(result.transformation), inliers, "fpfh")]
+        if inliers:
+            yield Hypothesis(np.array(result.transformation), inliers, "fpfh")
 
 
 def _features(view: PreparedView) -> tuple[Any, Any]:

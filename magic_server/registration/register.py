@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +67,7 @@ def register(
     if best is None:
         return _result(NO_HYPOTHESIS, None, clock() - started)
     information = loop_information(best.refined.hessian, config)
-    reason = refusal(best.figures, best.hypothesis.inliers, information, config)
-    return _result(reason or ACCEPTED, best, clock() - started, information)
+    return _result(best.refusal(config) or ACCEPTED, best, clock() - started, information)
 
 
 def loop_information(hessian: Array, config: RegistrationConfig) -> Array:
@@ -89,22 +89,41 @@ class _Candidate:
     figures: Figures
     pairs: tuple[FramePair, ...]
 
+    def refusal(self, config: RegistrationConfig) -> str:
+        """The reason code of the first gate that fails; empty if all pass."""
+        information = loop_information(self.refined.hessian, config)
+        return refusal(self.figures, self.hypothesis.inliers, information, config)
+
 
 def _best_candidate(
     source: PreparedView, target: PreparedView, config: RegistrationConfig
 ) -> _Candidate | None:
-    """Refine every hypothesis coarsely, the best one fully."""
+    """The first hypothesis that passes every gate, or else the one that agrees best.
+
+    Hypotheses are made one after the other, cheap ones first, and refined coarsely. What then
+    looks right is refined fully; if it passes, the remaining ones are never made.
+    """
     a, b = Pyramids(source, config), Pyramids(target, config)
-    candidates = []
+    best: _Candidate | None = None
+    for hypothesis in _hypotheses(source, target, config):
+        candidate = _coarsely_refined(a, b, hypothesis, config)
+        if candidate is None:
+            continue
+        if not candidate.refusal(config):
+            fine = _finely_refined(a, b, candidate, config)
+            if not fine.refusal(config):
+                return fine
+        if best is None or candidate.figures.score > best.figures.score:
+            best = candidate
+    return best and _finely_refined(a, b, best, config)
+
+
+def _hypotheses(
+    source: PreparedView, target: PreparedView, config: RegistrationConfig
+) -> Iterator[Hypothesis]:
     for name in config.methods:
         proposed = coarse_method(name).propose(source, target, config)
-        for hypothesis in proposed[: config.max_hypotheses]:
-            candidate = _coarsely_refined(a, b, hypothesis, config)
-            if candidate is not None:
-                candidates.append(candidate)
-    if not candidates:
-        return None
-    return _finely_refined(a, b, max(candidates, key=lambda c: c.figures.score), config)
+        yield from islice(proposed, config.max_hypotheses)
 
 
 def _coarsely_refined(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,19 +28,19 @@ class VisualMatching:
 
     def propose(
         self, source: PreparedView, target: PreparedView, config: RegistrationConfig
-    ) -> list[Hypothesis]:
+    ) -> Iterator[Hypothesis]:
         pairs = _matches(source.keypoint_descriptors, target.keypoint_descriptors)
         if len(pairs) < LEAST_MATCHES:
-            return []
+            return
         a = source.keypoints[pairs[:, 0]].astype(np.float64)
         b = target.keypoints[pairs[:, 1]].astype(np.float64)
         tolerance = 0.02 + 3.0 * (_sigma(a, config) + _sigma(b, config))
         transforms = _sampled_transforms(a, b, tolerance, np.random.default_rng(config.seed))
         if not len(transforms):
-            return []
+            return
         moved = a @ transforms[:, :3, :3].swapaxes(1, 2) + transforms[:, None, :3, 3]
         inlier = np.linalg.norm(moved - b, axis=2) < tolerance  # (samples, matches)
-        return _distinct(a, b, inlier, tolerance, config)
+        yield from _distinct(a, b, inlier, tolerance, config)
 
 
 def _sigma(points: Array, config: RegistrationConfig) -> Array:

@@ -1,0 +1,142 @@
+"""Find the wrong loops of one component: who supports whom, chains first, then everything.
+
+1. Every loop asks its neighbours (consistency): those that disagree are not trusted at first.
+2. Every odometry chain is solved with its own trusted loops, which takes most of its drift out.
+3. Chains are placed by the consensus of the loops between them (placement).
+4. Graduated non-convexity over all trusted loops, then everything that fits is taken up.
+All of it again with wider bounds where that explains the loops better (noise was understated).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from magic_server.posegraph.chains import Chains, shortened
+from magic_server.posegraph.consistency import LocalSupport, local_support
+from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated
+from magic_server.posegraph.placement import known_frames, place
+from magic_server.posegraph.problem import PoseGraphConfig
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LEAST_SUPPORT_SHARE = 0.5
+"""A trusted loop agrees with this share of its neighbours, and with two at least."""
+MIN_TRUSTED_SHARE = 0.25
+"""Below this, loops are too sparse to speak for each other, and all of them take part."""
+SEED_SHARE = 0.25
+"""Clusters of this size, relative to the largest, are solved with first."""
+MAX_SCALE = 8.0
+NEAR_MISS_SHARE = 0.1
+REJECTION_NATS = 25.0
+"""What it costs to call a loop wrong: it could point anywhere in a building."""
+
+
+class RobustSolver:
+    """Solves one component; vertices are numbered from 0, the oldest first."""
+
+    def __init__(
+        self,
+        graph: RobustGraph,
+        chains: Chains,
+        priors: Mapping[int, Array],
+        config: PoseGraphConfig,
+    ) -> None:
+        self._graph = graph
+        self._priors = priors
+        self._limit = float(chi2.ppf(config.inlier_probability, 6))
+        self._chains = chains
+
+    def solve(self) -> GncResult:
+        """GNC, again with wider bounds while that explains the loops better."""
+        scale = 1.0
+        best = self._at_scale(scale)
+        cost = self._description_cost(best, scale)
+        while scale < MAX_SCALE and self._has_near_misses(best):
+            scale *= 2.0
+            wider = self._at_scale(scale)
+            wider_cost = self._description_cost(wider, scale)
+            if wider_cost >= cost:
+                break
+            best, cost = wider, wider_cost
+        return best
+
+    def _at_scale(self, scale: float) -> GncResult:
+        graph, limit = self._graph, self._limit * scale**2
+        support = local_support(graph.loops, self._chains, scale=scale)
+        trusted = _trusted(support)
+        if trusted.sum() < MIN_TRUSTED_SHARE * len(trusted):
+            trusted = np.ones_like(trusted)
+        if len(self._chains.oldest) == 1:
+            seed = trusted & (support.cluster_size >= SEED_SHARE * support.cluster_size.max())
+            start = self._placed(self._chains, trusted)
+            return graduated(graph, start, limit=limit, seed=seed, candidates=trusted)
+        chains = self._straightened(support, trusted, limit)
+        start = self._placed(chains, trusted, scale=scale)
+        return graduated(graph, start, limit=limit, seed=None, candidates=trusted)
+
+    def _placed(self, chains: Chains, trusted: Mask, *, scale: float = 1.0) -> Array:
+        known = known_frames(chains, self._priors)
+        return place(chains, self._graph.loops, known, weights=1.0 * trusted, scale=scale)
+
+    def _straightened(self, support: LocalSupport, trusted: Mask, limit: float) -> Chains:
+        """The chains, each solved with its own trusted loops."""
+        loops, chain = self._graph.loops, self._chains.chain
+        own = trusted & (chain[loops.source] == chain[loops.target])
+        poses = self._chains.poses.copy()
+        kept = np.zeros(len(loops), dtype=bool)
+        for oldest in np.unique(chain[loops.source[own]]).tolist():
+            inside = np.flatnonzero(own & (chain[loops.source] == oldest))
+            members = np.flatnonzero(chain == oldest)
+            result = self._solved_alone(members, inside, support, limit)
+            poses[members] = result.poses
+            kept[inside] = result.kept
+        straight = replace(self._chains, poses=poses)
+        return shortened(straight, self._graph.odometry, loops.select(kept))
+
+    def _solved_alone(
+        self, members: NDArray, inside: NDArray, support: LocalSupport, limit: float
+    ) -> GncResult:
+        """One chain with the given loops, its oldest vertex at identity."""
+        new_number = np.full(len(self._chains.chain), -1, dtype=np.int64)
+        new_number[members] = np.arange(len(members))
+        odometry = self._graph.odometry
+        alone = RobustGraph(
+            odometry.select(new_number[odometry.source] >= 0).renumbered(new_number),
+            self._graph.loops.select(inside).renumbered(new_number),
+            {0: np.eye(4)},
+        )
+        sizes = support.cluster_size[inside]
+        seed = sizes >= SEED_SHARE * sizes.max()
+        return graduated(alone, self._chains.poses[members], limit=limit, seed=seed)
+
+    def _description_cost(self, result: GncResult, scale: float) -> float:
+        """Negative log-likelihood (nats, up to a constant) of noise `scale` times the claimed.
+
+        Residuals count by their degrees of freedom (restricted likelihood, as odometry alone has
+        none).
+        """
+        graph = self._graph
+        kept = graph.loops.select(result.kept)
+        fixed = len(self._priors) or 1
+        freedom = 6 * max(len(graph.odometry) + len(kept) + fixed - len(result.poses), 0)
+        squared = graph.odometry.squared_norms(result.poses).sum()
+        squared += kept.squared_norms(result.poses).sum()
+        rejected = len(graph.loops) - len(kept)
+        fit = squared / (2 * scale**2) + freedom * np.log(scale)
+        return float(fit + rejected * REJECTION_NATS)
+
+    def _has_near_misses(self, result: GncResult) -> bool:
+        """Whether many loops were rejected that a larger noise would explain."""
+        squared = self._graph.loops.squared_norms(result.poses)
+        near = ~result.kept & (squared < self._limit * MAX_SCALE**2)
+        return near.sum() > NEAR_MISS_SHARE * max(result.kept.sum(), 1)
+
+
+def _trusted(support: LocalSupport) -> Mask:
+    return (support.agreeing >= 2) & (support.agreeing >= support.asked * LEAST_SUPPORT_SHARE)
