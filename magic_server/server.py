@@ -6,6 +6,7 @@ import asyncio
 import gc
 import logging
 import signal
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
@@ -84,9 +85,6 @@ class Server:
         except BaseException:
             await self.stop()
             raise
-        # What is alive now stays alive: the collector need not walk through it again.
-        gc.collect()
-        gc.freeze()
         logger.info("serving on %s, data in %s", self.address, self.config.data_dir)
 
     async def stop(self) -> None:
@@ -101,7 +99,6 @@ class Server:
         await self._jobs.close()
         await self._store.close()
         self._threads.shutdown(wait=True)
-        gc.unfreeze()
 
     async def _listen(self) -> None:
         listen = self.config.listen
@@ -147,6 +144,7 @@ async def serve(config: ServerConfig, *, on_ready: Callable[[Server], None] | No
         loop.add_signal_handler(number, stop.set)
     try:
         async with Server(config) as server:
+            _keep_the_loop_smooth()
             if on_ready is not None:
                 on_ready(server)
             await stop.wait()
@@ -154,3 +152,12 @@ async def serve(config: ServerConfig, *, on_ready: Callable[[Server], None] | No
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.remove_signal_handler(number)
+
+
+def _keep_the_loop_smooth() -> None:
+    """Settings of a process that does nothing but serve."""
+    # What is alive now stays alive: the collector need not walk through it again.
+    gc.collect()
+    gc.freeze()
+    # The loop waits this long for threads that compute; 5 ms is Python's own figure.
+    sys.setswitchinterval(0.001)

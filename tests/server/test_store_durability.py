@@ -1,0 +1,181 @@
+"""The store: blobs are whole or not there, transactions refer to what is on disk."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hashlib
+import os
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from magic_core.errors import CorruptData, NotFound, ResourceExhausted, WrongState
+from magic_core.submap import Submap
+from magic_core.wire import encode_submap
+from magic_core.wire.submap import decode_odometry
+from magic_server.store import BlobFolder, BlobWriter, NewSubmap, Store, Vertex
+from magic_server.store.blobs import translated_disk_errors
+from tests.small_world import DIMENSION, MODEL_ID, make_submap
+
+
+@pytest.fixture
+async def store(tmp_path: Path) -> AsyncIterator[Store]:
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads) as opened:
+            yield opened
+
+
+def written(folder: BlobFolder, data: bytes) -> BlobWriter:
+    blob = folder.writer()
+    blob.write(data)
+    blob.finish()
+    return blob
+
+
+def new_submap(submap: Submap, store: Store) -> tuple[NewSubmap, list[BlobWriter]]:
+    encoded = encode_submap(submap, request_id="r")
+    blobs = [written(store.blobs, blob) for blob in encoded.blobs]
+    vertex = Vertex(
+        name=submap.name,
+        agent=f"sessions/{submap.session}/agents/{submap.agent}",
+        index=submap.index,
+        descriptor=submap.descriptor,
+        odometry=decode_odometry(encoded.header),
+        prior=None,
+        searched=False,
+    )
+    digests = tuple(blob.sha256 for blob in blobs)
+    return NewSubmap(encoded.header, bytes(32), len(submap.gaussians), digests, vertex), blobs
+
+
+async def registered(store: Store, agent: str = "agent_0"):
+    row, _ = await store.agents.register(
+        "room", agent, model_id=MODEL_ID, dimension=DIMENSION, now=1.0
+    )
+    return row
+
+
+def test_a_blob_is_named_by_its_content_and_checked_when_read(tmp_path: Path) -> None:
+    folder = BlobFolder(tmp_path)
+    folder.open()
+    data = b"some bytes" * 1000
+    (name,) = folder.adopt([written(folder, data)])
+    assert name == hashlib.sha256(data).hexdigest()
+    assert folder.read(name) == data
+    assert folder.adopt([written(folder, data)]) == []  # known already
+    assert list(folder.incoming.iterdir()) == []
+    folder.path(name).write_bytes(data[:-1] + b"x")
+    with pytest.raises(CorruptData):
+        folder.read(name)
+    folder.remove([name])
+    with pytest.raises(NotFound):
+        folder.read(name)
+
+
+def test_what_a_dead_server_was_writing_is_dropped_at_the_next_start(tmp_path: Path) -> None:
+    folder = BlobFolder(tmp_path)
+    folder.open()
+    folder.writer().write(b"half a blo")
+    folder.open()
+    assert list(folder.incoming.iterdir()) == []
+    assert list(folder.names()) == []
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_a_limit_and_not_a_crash(number: int) -> None:
+    with pytest.raises(ResourceExhausted, match="disk is full"), translated_disk_errors():
+        raise OSError(number, os.strerror(number))
+    with pytest.raises(PermissionError), translated_disk_errors():
+        raise PermissionError(errno.EACCES, "no")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, which Linux has")
+def test_a_blob_that_does_not_fit_raises_resource_exhausted(tmp_path: Path) -> None:
+    blob = BlobWriter(tmp_path)
+    os.dup2(os.open("/dev/full", os.O_WRONLY), blob._file.fileno())
+    with pytest.raises(ResourceExhausted):
+        blob.write(bytes(1 << 20))
+        blob.finish()
+    blob.path.unlink()
+
+
+async def test_a_submap_is_found_again_by_another_store(tmp_path: Path) -> None:
+    submaps = [make_submap(index=i) for i in range(3)]
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads) as store:
+            agent = await registered(store)
+            for submap in submaps:
+                made, blobs = new_submap(submap, store)
+                assert await store.add_submap(agent, made, blobs, now=2.0) is None
+        async with Store(tmp_path, threads) as store:
+            session = await store.agents.session("room")
+            vertices = await store.submaps.vertices(session)
+            assert [vertex.name for vertex in vertices] == [submap.name for submap in submaps]
+            assert [v.odometry and v.odometry.previous_index for v in vertices] == [None, 0, 1]
+            assert (vertices[1].descriptor.vector == submaps[1].descriptor.vector).all()
+            stored = await store.submaps.stored(session, "agent_0", 1)
+            encoded = encode_submap(submaps[1], request_id="r")
+            assert stored.header == encoded.header.SerializeToString()
+            assert [path.read_bytes() for path in stored.blobs] == list(encoded.blobs)
+
+
+async def test_blobs_without_a_transaction_are_removed_at_the_next_start(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads) as store:
+            agent = await registered(store)
+            made, blobs = new_submap(make_submap(), store)
+            await store.add_submap(agent, made, blobs, now=2.0)
+            kept = set(store.blobs.names())
+            _, orphans = new_submap(make_submap(index=1), store)
+            store.blobs.adopt(orphans)  # as if the server died before the transaction
+            assert set(store.blobs.names()) > kept
+        async with Store(tmp_path, threads) as store:
+            assert set(store.blobs.names()) == kept
+
+
+async def test_a_transaction_that_fails_takes_its_blobs_back(store: Store) -> None:
+    agent = await registered(store)
+    made, blobs = new_submap(make_submap(), store)
+    broken = NewSubmap(
+        made.header,
+        made.header_sha256,
+        made.gaussian_count,
+        (None,) * 5,
+        made.vertex,  # type: ignore[arg-type]
+    )
+    with pytest.raises(Exception, match="NOT NULL"):
+        await store.add_submap(agent, broken, blobs, now=2.0)
+    assert list(store.blobs.names()) == []
+    assert await store.submaps.first_answer(agent, 0) is None
+
+
+async def test_a_blob_that_another_submap_holds_survives_a_failure(store: Store) -> None:
+    first, second = await registered(store), await registered(store, "agent_1")
+    made, blobs = new_submap(make_submap(), store)
+    await store.add_submap(first, made, blobs, now=2.0)
+    kept = set(store.blobs.names())
+    again, blobs = new_submap(make_submap(), store)
+    broken = NewSubmap(
+        again.header,
+        again.header_sha256,
+        0,
+        (None,) * 5,
+        again.vertex,  # type: ignore[arg-type]
+    )
+    with pytest.raises(Exception, match="NOT NULL"):
+        await store.add_submap(second, broken, blobs, now=2.0)
+    assert set(store.blobs.names()) == kept
+
+
+async def test_a_folder_has_one_owner(store: Store) -> None:
+    with ThreadPoolExecutor(1) as threads, pytest.raises(WrongState, match="another server"):
+        await Store(store.folder, threads).open()
+
+
+async def test_concurrent_writers_take_turns(store: Store) -> None:
+    rows = await asyncio.gather(*(registered(store, f"agent_{i}") for i in range(20)))
+    assert len({row.id for row in rows}) == 20
+    assert len({row.session.id for row in rows}) == 1
