@@ -10,11 +10,13 @@ of their own; here both are the right perturbation of `anchor_from_camera`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import AdamConfig, GaussNewtonConfig
-from magic_agent.tracking.gauss_newton import GaussNewton
+from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, View
 from magic_agent.tracking.pyramid import Pyramid, view_pyramid
 from magic_agent.tracking.refinement import DifferentiableView, Pose, ReferenceView, Refinement
 from magic_agent.tracking.result import StageClock
@@ -42,9 +44,10 @@ class AdamRefiner:
         *,
         anchor_from_camera: Pose,
         reference: ReferenceView,
+        keyframes: Sequence[View] = (),
         clock: StageClock,
     ) -> Refinement:
-        """The pose after all steps; its quality is that of a last render there."""
+        """The pose after all steps, by the sub-map alone; its fit is that of a last render."""
         if not isinstance(reference, DifferentiableView):
             raise ConfigError.field(
                 "tracking.solver", "adam needs a reference view with gradients (`backward`)"
@@ -67,8 +70,8 @@ class AdamRefiner:
         with clock.stage("render"):
             view = reference(pose).image
         with clock.stage("loss"):
-            alignment = self._judged(view, image)
-        return Refinement(pose, pose, alignment, self._config.iterations + 1)
+            alignment = self._judged(view, image, pose)
+        return Refinement(alignment, self._config.iterations + 1)
 
     def loss_gradient(self, view: Float32, target: Float32) -> Float32:
         """dL / d view (5, h, w) of the paper's loss; target is (4, h, w) colour and depth.
@@ -97,9 +100,9 @@ class AdamRefiner:
         inlier = valid & (absolute <= self._config.inlier_factor * median)
         return np.where(inlier, view[4] ** self._config.alpha_power, 0.0).astype(np.float32)
 
-    def _judged(self, view: Float32, image: Pyramid):
+    def _judged(self, view: Float32, image: Pyramid, pose: Pose) -> Alignment:
         config = self._quality
         pyramid = view_pyramid(
             view, camera=image.cameras[0], levels=1, alpha_power=config.alpha_power
         )
-        return GaussNewton(config).evaluate(pyramid, image, reference_from_camera=np.eye(4))
+        return GaussNewton(config).evaluate([View(pyramid, pose)], image, anchor_from_camera=pose)

@@ -42,12 +42,30 @@ class GaussNewtonConfig:
     """Inlier mask: depth errors beyond this many medians are left out (paper: 50)."""
     residuals: ResidualModel = field(default_factory=ResidualModel)
     """Noise model and robust widths."""
+    min_contrast: float = 0.01
+    """Below this standard deviation of grey values colour does not count (dark, covered lens)."""
     pixels_per_sample: float = 60.0
     """Neighbouring residuals are correlated: this many pixels count as one measurement."""
     prior_translation_m: float = 0.05
     """Deviation of the motion prior; it decides only where the images do not."""
     prior_rotation_deg: float = 3.0
     """Deviation of the motion prior; it decides only where the images do not."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeWindowConfig:
+    """Earlier images that Gauss-Newton aligns with, beside the rendered sub-map."""
+
+    images: int = 2
+    """Most images in the window; 0 aligns with the sub-map alone, as the paper does."""
+    new_overlap: float = 0.8
+    """The current image joins when the newest one's overlap with it falls below this share."""
+    min_overlap: float = 0.45
+    """An image leaves when its overlap with the current one falls below this share."""
+    min_inlier_share: float = 0.6
+    """An image leaves when fewer of its depths agree with the current one."""
+    finest_level: int = 1
+    """Finest pyramid level at which images are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +139,7 @@ class TrackingConfig:
     rotation_prealignment: bool = True
     """Align the rotation on tiny images first where the prediction does not fit (fast turns)."""
     gauss_newton: GaussNewtonConfig = field(default_factory=GaussNewtonConfig)
+    window: KeyframeWindowConfig = field(default_factory=KeyframeWindowConfig)
     adam: AdamConfig = field(default_factory=AdamConfig)
     lost: LostConfig = field(default_factory=LostConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)

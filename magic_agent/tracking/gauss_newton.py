@@ -1,14 +1,19 @@
-"""Coarse-to-fine Levenberg-Marquardt alignment of an RGB-D image with a reference view.
+"""Coarse-to-fine Levenberg-Marquardt alignment of an RGB-D image with reference views.
 
 The residuals and their derivatives are those of `magic_core.render.linearisation`. What is
-estimated is `reference_from_camera`, updated on the left (T <- exp(xi) T), with gain and bias of
-the image. A motion prior joins the normal equations as one more measurement; it is weak, so that
-it decides only along directions which the images leave open.
+estimated is `anchor_from_camera`, updated on the right (T <- T exp(xi)), and one gain and bias of
+the image against each view. Several views, the rendered sub-map and keyframes, add up: each gives
+normal equations in its own frame, left perturbation of view_from_camera, and as
+exp(x) T = T exp(Ad(T)^-1 x), its part in the camera's frame is Ad^T H Ad and Ad^T b.
+
+A motion prior joins as one more measurement; it is weak, so that it decides only along directions
+which the images leave open.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,41 +35,66 @@ _MEDIAN_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
-    """A solution and what is known of its quality."""
+class View:
+    """A reference view and where it was taken."""
 
-    reference_from_camera: Float64  # (4, 4)
-    gain: float
-    bias: float
-    equations: NormalEquations
-    """At the solution, on the finest level that was used; without the motion prior."""
-    model: ResidualModel
-    """With the scales that were estimated on that level."""
-    pixels: int
-    """Number of pixels of that level."""
-
-    def information(self, pixels_per_sample: float) -> Float64:
-        """(6, 6) information of reference_from_camera, left perturbation; gain, bias eliminated."""
-        hessian = self.equations.hessian / pixels_per_sample
-        nuisance = hessian[6:, 6:] + 1e-6 * np.eye(2)
-        coupling = hessian[:6, 6:]
-        information = hessian[:6, :6] - coupling @ np.linalg.solve(nuisance, coupling.T)
-        return 0.5 * (information + information.T)
+    pyramid: Pyramid
+    """Reference levels (5, h, w); levels finer than `finest` may be empty."""
+    anchor_from_view: Float64  # (4, 4)
+    finest: int = 0
+    """The finest level to look at; below, the view's last normal equations stand for it."""
+    gain: float = 1.0
+    bias: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class MotionPrior:
     """Where motion is expected to lead, and how far off that may be."""
 
-    reference_from_camera: Float64  # (4, 4)
-    information: Float64  # (6, 6), left perturbation
+    anchor_from_camera: Float64  # (4, 4)
+    information: Float64  # (6, 6), right perturbation
 
     @classmethod
-    def around(cls, reference_from_camera: Float64, config: GaussNewtonConfig) -> MotionPrior:
+    def around(cls, anchor_from_camera: Float64, config: GaussNewtonConfig) -> MotionPrior:
         """The prior with the deviations of the configuration."""
         translation = 1.0 / config.prior_translation_m**2
         rotation = 1.0 / np.radians(config.prior_rotation_deg) ** 2
-        return cls(reference_from_camera, np.diag([translation] * 3 + [rotation] * 3))
+        return cls(anchor_from_camera, np.diag([translation] * 3 + [rotation] * 3))
+
+
+@dataclass(frozen=True, slots=True)
+class ViewFit:
+    """How the image fits one view at the solution, on the finest level that was looked at."""
+
+    equations: NormalEquations
+    model: ResidualModel
+    """With the scales that were estimated on that level."""
+    gain: float
+    bias: float
+    pixels: int
+    """Number of pixels of that level."""
+
+    @property
+    def visible_share(self) -> float:
+        """Share of the view, weighted by its mask, that falls into the image."""
+        return self.equations.visible / self.pixels
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the depths seen in both that agree."""
+        return self.equations.agreeing / max(self.equations.measured, 1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """A solution and what is known of its quality."""
+
+    anchor_from_camera: Float64  # (4, 4)
+    fits: tuple[ViewFit, ...]
+    """One per view, in the order given."""
+    information: Float64
+    """(6, 6) of anchor_from_camera from the images alone, right perturbation, gains and biases
+    eliminated; correlated pixels are accounted for."""
 
 
 class GaussNewton:
@@ -75,169 +105,202 @@ class GaussNewton:
 
     def align(
         self,
-        reference: Pyramid,
+        views: Sequence[View],
         image: Pyramid,
         *,
-        reference_from_camera: Float64,
+        anchor_from_camera: Float64,
         prior: MotionPrior | None = None,
         coarsest: int | None = None,
         finest: int | None = None,
-        gain: float = 1.0,
-        bias: float = 0.0,
     ) -> Alignment:
         """Align from the coarsest to the finest level (inclusive), starting at the given pose."""
-        first = len(reference) - 1 if coarsest is None else min(coarsest, len(reference) - 1)
         last = self._config.finest_level if finest is None else finest
-        state = _State(reference_from_camera, gain, bias)
-        result = None
+        first = len(image) - 1 if coarsest is None else min(coarsest, len(image) - 1)
+        terms = [_Term(view, image, self._config) for view in views]
+        pose = anchor_from_camera
         for level in range(first, min(last, first) - 1, -1):
-            problem = _Problem(
-                reference.levels[level], image.levels[level], reference.cameras[level]
-            )
-            result = self._solve_level(problem, state, prior=prior, level=level)
-            state = _State(result.reference_from_camera, result.gain, result.bias)
-        assert result is not None
-        return result
+            pose = self._solve_level(terms, level, pose, prior)
+        return self._alignment(terms, pose)
 
     def evaluate(
-        self, reference: Pyramid, image: Pyramid, *, reference_from_camera: Float64, level: int = 0
+        self, views: Sequence[View], image: Pyramid, *, anchor_from_camera: Float64
     ) -> Alignment:
-        """The quality of a given pose, found elsewhere (gain 1, bias 0)."""
-        camera = reference.cameras[level]
-        problem = _Problem(reference.levels[level], image.levels[level], camera)
-        state = _State(reference_from_camera, 1.0, 0.0)
-        model = self._model(problem, state)
-        equations = problem.linearise(state, model)
-        pixels = camera.width * camera.height
-        return Alignment(reference_from_camera, 1.0, 0.0, equations, model, pixels)
+        """The quality of a pose that was found elsewhere, on the full image."""
+        terms = [_Term(view, image, self._config) for view in views]
+        for term in terms:
+            term.begin_level(0, anchor_from_camera)
+        return self._alignment(terms, anchor_from_camera)
+
+    def _alignment(self, terms: list[_Term], pose: Float64) -> Alignment:
+        information = sum((term.current.hessian for term in terms), np.zeros((6, 6)))
+        information = information / self._config.pixels_per_sample
+        return Alignment(pose, tuple(term.fit() for term in terms), information)
 
     def _solve_level(
-        self, problem: _Problem, state: _State, *, prior: MotionPrior | None, level: int
-    ) -> Alignment:
+        self, terms: list[_Term], level: int, pose: Float64, prior: MotionPrior | None
+    ) -> Float64:
         config = self._config
-        model = self._model(problem, state)
-        equations = problem.linearise(state, model)
-        cost = self._cost(equations, state, prior)
-        damping = _FIRST_DAMPING
+        for term in terms:
+            term.begin_level(level, pose)
+        cost, damping = self._cost(terms, pose, prior), _FIRST_DAMPING
         for _ in range(config.iterations[min(level, len(config.iterations) - 1)]):
-            step = self._step(equations, state, prior=prior, damping=damping)
-            trial = state.moved(step)
-            trial_equations = problem.linearise(trial, model)
-            trial_cost = self._cost(trial_equations, trial, prior)
-            small = problem.pixels_moved(step) < config.converged_pixels
+            step = self._step(terms, pose, prior=prior, damping=damping)
+            trial = pose @ se3.exp(step)
+            for term in terms:
+                term.try_pose(trial, step)
+            trial_cost = self._cost(terms, trial, prior)
             if trial_cost <= cost:
-                state, equations, cost = trial, trial_equations, trial_cost
-                damping = max(damping * 0.1, 1e-7)
+                pose, cost, damping = trial, trial_cost, max(damping * 0.1, 1e-7)
             else:
                 damping *= 30.0
-            if small:
+                for term in terms:
+                    term.step_back()
+            if _pixels_moved(step, terms[0].camera) < config.converged_pixels:
                 break
-        size = problem.camera.width * problem.camera.height
-        return Alignment(
-            state.reference_from_camera, state.gain, state.bias, equations, model, size
-        )
+        return pose
 
-    def _model(self, problem: _Problem, state: _State) -> ResidualModel:
-        """The residual model with scales and the inlier gate of the data at this pose."""
-        model = problem.estimate_scales(state, self._config.residuals)
-        # The paper counts medians, the gate counts standard deviations.
-        return model.with_gate(self._config.inlier_factor / _MEDIAN_TO_SIGMA)
-
-    def _cost(self, equations: NormalEquations, state: _State, prior: MotionPrior | None) -> float:
-        """Mean robust cost per pixel, with the priors' share."""
-        total = equations.cost + 0.5 * self._config.pixels_per_sample * (
-            state.prior_cost(prior) + self._photometric_prior_cost(state)
-        )
-        return total / max(equations.visible, 1e-9)
-
-    def _photometric_prior_cost(self, state: _State) -> float:
-        if not self._config.photometric:
-            return 0.0
-        return ((state.gain - 1.0) / self._config.gain_deviation) ** 2 + (
-            state.bias / self._config.bias_deviation
-        ) ** 2
+    def _cost(self, terms: list[_Term], pose: Float64, prior: MotionPrior | None) -> float:
+        """Mean robust cost per visible pixel, with the priors' share."""
+        total = sum(term.current.cost for term in terms)
+        if prior is not None:
+            deviation = se3.log(se3.inverse(prior.anchor_from_camera) @ pose)
+            quadratic = float(deviation @ prior.information @ deviation)
+            total += 0.5 * self._config.pixels_per_sample * quadratic
+        return total / max(sum(term.current.visible for term in terms), 1e-9)
 
     def _step(
-        self,
-        equations: NormalEquations,
-        state: _State,
-        *,
-        prior: MotionPrior | None,
-        damping: float,
+        self, terms: list[_Term], pose: Float64, *, prior: MotionPrior | None, damping: float
     ) -> Float64:
-        """(8,) damped step of pose, gain and bias; the last two are 0 if they are held."""
-        config = self._config
-        hessian, gradient = equations.hessian.copy(), equations.gradient.copy()
-        weight = config.pixels_per_sample
+        """(6,) damped step of the pose."""
+        hessian = sum((term.current.hessian for term in terms), np.zeros((6, 6)))
+        gradient = sum((term.current.gradient for term in terms), np.zeros(6))
         if prior is not None:
-            deviation = state.deviation(prior)
-            hessian[:6, :6] += weight * prior.information
-            gradient[:6] += weight * prior.information @ deviation
-        information = np.array([config.gain_deviation, config.bias_deviation]) ** -2.0
-        hessian[(6, 7), (6, 7)] += weight * information
-        gradient[6:] += weight * information * (state.gain - 1.0, state.bias)
-        free = 8 if config.photometric else 6
-        damped = hessian[:free, :free] + np.diag(damping * np.diag(hessian)[:free] + 1e-9)
-        step = np.zeros(8)
-        step[:free] = np.linalg.solve(damped, -gradient[:free])
-        return step
+            weighted = self._config.pixels_per_sample * prior.information
+            hessian = hessian + weighted
+            deviation = se3.log(se3.inverse(prior.anchor_from_camera) @ pose)
+            gradient = gradient + weighted @ deviation
+        damped = hessian + np.diag(damping * np.diag(hessian) + 1e-9)
+        return np.asarray(np.linalg.solve(damped, -gradient), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
-    """What is estimated."""
+class _Linearisation:
+    """One view's part at one pose, in the camera's frame; gain and bias are eliminated."""
 
-    reference_from_camera: Float64
-    gain: float
-    bias: float
+    hessian: Float64  # (6, 6)
+    gradient: Float64  # (6,)
+    photometric_step: Float64  # (2,) best change of gain and bias while the pose stays
+    photometric_slope: Float64  # (2, 6) further change of them per unit of the pose's step
+    cost: float
+    visible: float
 
-    def moved(self, step: Float64) -> _State:
-        return _State(
-            se3.exp(step[:6]) @ self.reference_from_camera,
-            self.gain + float(step[6]),
-            self.bias + float(step[7]),
+
+class _Term:
+    """One view's share of the problem: its state (gain, bias, scales) and last linearisation."""
+
+    def __init__(self, view: View, image: Pyramid, config: GaussNewtonConfig) -> None:
+        self._view = view
+        self._image = image
+        self._config = config
+        self._view_from_anchor = se3.inverse(view.anchor_from_view)
+        self._photometric = np.array([view.gain, view.bias])
+        self._model = config.residuals
+        self._level = -1
+        self._frozen: Float64 | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the level that is being solved."""
+        return self._view.pyramid.cameras[self._level]
+
+    def begin_level(self, level: int, pose: Float64) -> None:
+        """Estimate the scales at this pose and linearise; a level too fine freezes the view."""
+        if self._level >= 0 and level < self._view.finest:
+            self._frozen = pose if self._frozen is None else self._frozen
+            self._before = (self.current, self._photometric)
+            return
+        self._level = max(level, self._view.finest)
+        model = self._config.residuals
+        if self._image_is_dark():
+            model = replace(model, colour_weight=0.0)
+        model = estimate_scales(*self._levels(), model=model, **self._arguments(pose))
+        # The paper counts medians, the gate counts standard deviations.
+        self._model = model.with_gate(self._config.inlier_factor / _MEDIAN_TO_SIGMA)
+        self.current = self._linearise(pose)
+
+    def try_pose(self, pose: Float64, step: Float64) -> None:
+        """Move to a trial pose; `step_back` returns."""
+        self._before = (self.current, self._photometric)
+        if self._frozen is not None:
+            self.current = self._moved_quadratic(step)
+            return
+        change = self.current.photometric_step + self.current.photometric_slope @ step
+        self._photometric = self._photometric + change
+        self.current = self._linearise(pose)
+
+    def step_back(self) -> None:
+        """Undo the last `try_pose`."""
+        self.current, self._photometric = self._before
+
+    def fit(self) -> ViewFit:
+        """How the image fits this view now."""
+        gain, bias = self._photometric
+        size = self.camera.width * self.camera.height
+        return ViewFit(self._equations, self._model, float(gain), float(bias), size)
+
+    def _levels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self._view.pyramid.levels[self._level], self._image.levels[self._level]
+
+    def _arguments(self, pose: Float64) -> dict:
+        gain, bias = self._photometric
+        return {
+            "camera": self.camera,
+            "camera_from_reference": se3.inverse(self._view_from_anchor @ pose),
+            "gain": float(gain),
+            "bias": float(bias),
+        }
+
+    def _image_is_dark(self) -> bool:
+        return float(self._image.levels[-1][..., 1].std()) < self._config.min_contrast
+
+    def _linearise(self, pose: Float64) -> _Linearisation:
+        config = self._config
+        equations = linearise(*self._levels(), model=self._model, **self._arguments(pose))
+        self._equations = equations
+        adjoint = se3.adjoint(self._view_from_anchor @ pose)
+        hessian = adjoint.T @ equations.hessian[:6, :6] @ adjoint
+        gradient = adjoint.T @ equations.gradient[:6]
+        if not config.photometric or self._model.colour_weight == 0.0:
+            return _Linearisation(
+                hessian, gradient, np.zeros(2), np.zeros((2, 6)), equations.cost, equations.visible
+            )
+        weight = config.pixels_per_sample * np.array(
+            [config.gain_deviation**-2.0, config.bias_deviation**-2.0]
+        )
+        off = self._photometric - (1.0, 0.0)
+        coupling = adjoint.T @ equations.hessian[:6, 6:]
+        inverse = np.linalg.inv(equations.hessian[6:, 6:] + np.diag(weight))
+        slope = equations.gradient[6:] + weight * off
+        return _Linearisation(
+            hessian=hessian - coupling @ inverse @ coupling.T,
+            gradient=gradient - coupling @ inverse @ slope,
+            photometric_step=-inverse @ slope,
+            photometric_slope=-inverse @ coupling.T,
+            cost=equations.cost + 0.5 * float(weight @ off**2),
+            visible=equations.visible,
         )
 
-    def deviation(self, prior: MotionPrior) -> Float64:
-        return se3.log(self.reference_from_camera @ se3.inverse(prior.reference_from_camera))
-
-    def prior_cost(self, prior: MotionPrior | None) -> float:
-        if prior is None:
-            return 0.0
-        deviation = self.deviation(prior)
-        return float(deviation @ prior.information @ deviation)
-
-
-@dataclass(frozen=True, slots=True)
-class _Problem:
-    """One level's reference view and image."""
-
-    reference: NDArray[np.float32]
-    image: NDArray[np.float32]
-    camera: Camera
-
-    def linearise(self, state: _State, model: ResidualModel) -> NormalEquations:
-        return linearise(
-            self.reference,
-            self.image,
-            camera=self.camera,
-            camera_from_reference=se3.inverse(state.reference_from_camera),
-            model=model,
-            gain=state.gain,
-            bias=state.bias,
+    def _moved_quadratic(self, step: Float64) -> _Linearisation:
+        """The last linearisation as a function of the pose, at a step from where it stood."""
+        last = self.current
+        moved = last.hessian @ step
+        return replace(
+            last,
+            gradient=last.gradient + moved,
+            cost=last.cost + float(last.gradient @ step + 0.5 * step @ moved),
         )
 
-    def estimate_scales(self, state: _State, model: ResidualModel) -> ResidualModel:
-        return estimate_scales(
-            self.reference,
-            self.image,
-            camera=self.camera,
-            camera_from_reference=se3.inverse(state.reference_from_camera),
-            model=model,
-            gain=state.gain,
-            bias=state.bias,
-        )
 
-    def pixels_moved(self, step: Float64) -> float:
-        """Roughly how far a step moves the image, taking a scene at 2 m."""
-        return self.camera.fx * float(np.linalg.norm(step[3:6]) + np.linalg.norm(step[:3]) / 2.0)
+def _pixels_moved(step: Float64, camera: Camera) -> float:
+    """Roughly how far a step moves the image, taking a scene at 2 m."""
+    return camera.fx * float(np.linalg.norm(step[3:6]) + np.linalg.norm(step[:3]) / 2.0)

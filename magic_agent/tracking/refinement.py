@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import GaussNewtonConfig
-from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, MotionPrior
+from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, MotionPrior, View
 from magic_agent.tracking.pyramid import Pyramid, view_pyramid
 from magic_agent.tracking.result import StageClock
 from magic_core.data import Frame
@@ -58,19 +58,10 @@ class CloudView:
 
 @dataclass(frozen=True, slots=True)
 class Refinement:
-    """A refined pose; quality is measured on the last view that was rendered."""
+    """A refined pose and its fit; the first of its views is the sub-map as last rendered."""
 
-    anchor_from_camera: Pose
-    anchor_from_view: Pose
-    """Pose of that view."""
     alignment: Alignment
     renders: int
-
-    def information(self, pixels_per_sample: float) -> NDArray[np.float64]:
-        """(6, 6) information of anchor_from_camera, right perturbation."""
-        view_from_camera = self.alignment.reference_from_camera
-        adjoint = se3.adjoint(view_from_camera)
-        return adjoint.T @ self.alignment.information(pixels_per_sample) @ adjoint
 
 
 class Refiner(Protocol):
@@ -83,6 +74,7 @@ class Refiner(Protocol):
         *,
         anchor_from_camera: Pose,
         reference: ReferenceView,
+        keyframes: Sequence[View] = (),
         clock: StageClock,
     ) -> Refinement:
         """Refine a first estimate of `anchor_from_camera`."""
@@ -102,53 +94,42 @@ class GaussNewtonRefiner:
         *,
         anchor_from_camera: Pose,
         reference: ReferenceView,
+        keyframes: Sequence[View] = (),
         clock: StageClock,
     ) -> Refinement:
-        """The pose of the minimum near the given one; the prior is the given pose itself."""
-        config = _without_absent(self._config, frame)
-        start, pose = anchor_from_camera, anchor_from_camera
-        gain, bias = 1.0, 0.0
-        alignment = None
+        """The pose of the minimum near the given one, which is also the motion prior."""
+        config = self._config
+        prior = MotionPrior.around(anchor_from_camera, config)
+        pose = anchor_from_camera
         for count in range(1, config.renders + 1):
             with clock.stage("render"):
-                view = reference(pose)
+                rendered = reference(pose)
             with clock.stage("refinement"):
+                coarsest = len(image) - 1 if count == 1 else min(len(image) - 1, _FINE_LEVEL)
                 pyramid = view_pyramid(
-                    view.image,
+                    rendered.image,
                     camera=image.cameras[0],
-                    levels=len(image) if count == 1 else min(len(image), _FINE_LEVEL + 1),
+                    levels=coarsest + 1,
                     alpha_power=config.alpha_power,
                 )
                 alignment = GaussNewton(config).align(
-                    pyramid,
+                    [View(pyramid, pose), *keyframes],
                     image,
-                    reference_from_camera=np.eye(4),
-                    prior=MotionPrior.around(se3.inverse(pose) @ start, config),
-                    gain=gain,
-                    bias=bias,
+                    anchor_from_camera=pose,
+                    prior=prior,
+                    coarsest=coarsest,
                 )
-            rendered_at, pose = pose, pose @ alignment.reference_from_camera
-            gain, bias = alignment.gain, alignment.bias
-            if self._moved_pixels(alignment, image) < config.rerender_pixels:
-                break
-        assert alignment is not None
-        return Refinement(pose, rendered_at, alignment, count)
+            moved = se3.inverse(pose) @ alignment.anchor_from_camera
+            pose = alignment.anchor_from_camera
+            if count == config.renders or self._pixels(moved, image) < config.rerender_pixels:
+                return Refinement(alignment, count)
+        raise AssertionError("unreachable: renders is at least 1")
 
     @staticmethod
-    def _moved_pixels(alignment: Alignment, image: Pyramid) -> float:
-        """Roughly how far the view moved on the full image, taking a scene at 2 m."""
-        motion = alignment.reference_from_camera
+    def _pixels(motion: Pose, image: Pyramid) -> float:
+        """Roughly how far a motion moves the full image, taking a scene at 2 m."""
         shift = float(np.linalg.norm(motion[:3, 3])) / 2.0 + se3.rotation_angle(motion)
         return image.cameras[0].fx * shift
-
-
-def _without_absent(config: GaussNewtonConfig, frame: Frame) -> GaussNewtonConfig:
-    """Colour does not count in a frame that shows nothing (dark, covered lens)."""
-    if contrast(frame) > 0.01:
-        return config
-    return replace(
-        config, photometric=False, residuals=replace(config.residuals, colour_weight=0.0)
-    )
 
 
 def contrast(frame: Frame) -> float:

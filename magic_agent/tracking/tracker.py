@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from magic_agent.tracking.config import TrackingConfig
 from magic_agent.tracking.gauss_newton import MotionPrior
 from magic_agent.tracking.initialisation import make_initialiser
+from magic_agent.tracking.keyframe_window import KeyframeWindow
 from magic_agent.tracking.pyramid_cache import PyramidCache
 from magic_agent.tracking.refinement import (
     GaussNewtonRefiner,
@@ -48,6 +49,7 @@ class Tracker:
         self._pyramids = PyramidCache(camera, self._config.gauss_newton.levels)
         self._initialiser = make_initialiser(self._config, self._pyramids)
         self._refiner = _make_refiner(self._config)
+        self._window = KeyframeWindow(self._config.window)
         self._relocaliser: Relocaliser | None = None
 
     @property
@@ -58,6 +60,7 @@ class Tracker:
     def reset(self) -> None:
         """Forget the frames seen so far (after a jump of the camera or a lost track)."""
         self._initialiser.reset()
+        self._window.clear()
 
     def track(
         self,
@@ -84,20 +87,30 @@ class Tracker:
             image = self._pyramids.get(frame)
         with clock.stage("initialisation"):
             start = self._start(frame, previous, predicted)
+            self._window.start(previous, self._pyramids.get(previous))
         refinement = self._refiner.refine(
             frame,
             image,
             anchor_from_camera=anchor_from_previous @ start,
             reference=reference,
+            keyframes=self._window.views(anchor_from_previous),
             clock=clock,
         )
-        return self._result(
+        result = self._result(
             frame,
             refinement,
             anchor_from_previous=anchor_from_previous,
             predicted=predicted,
             clock=clock,
         )
+        if not result.lost and self._config.solver == "gauss_newton":
+            self._window.advance(
+                frame,
+                image,
+                last_from_frame=se3.inverse(anchor_from_previous) @ result.anchor_from_camera,
+                fits=refinement.alignment.fits[1:],
+            )
+        return result
 
     def refine(
         self, frame: Frame, *, anchor_from_camera: Pose, reference: ReferenceView
@@ -156,33 +169,31 @@ class Tracker:
         predicted: Pose,
         clock: StageClock,
     ) -> TrackingResult:
-        config = self._config.gauss_newton
-        prior = MotionPrior.around(np.eye(4), config).information
-        information = refinement.information(config.pixels_per_sample)
+        prior = MotionPrior.around(np.eye(4), self._config.gauss_newton).information
+        alignment = refinement.alignment
         judgement = judge(
             frame,
             refinement,
-            previous_from_camera=se3.inverse(anchor_from_previous) @ refinement.anchor_from_camera,
-            information=information,
+            previous_from_camera=se3.inverse(anchor_from_previous) @ alignment.anchor_from_camera,
             prior=prior,
             config=self._config.lost,
         )
         lost = judgement.verdict == "lost"
-        alignment = refinement.alignment
+        fit = alignment.fits[0]
         return TrackingResult(
             anchor_from_camera=(
-                anchor_from_previous @ predicted if lost else refinement.anchor_from_camera
+                anchor_from_previous @ predicted if lost else alignment.anchor_from_camera
             ),
-            information=prior if lost else information + prior,
+            information=prior if lost else alignment.information + prior,
             verdict=judgement.verdict,
             reason=judgement.reason,
             inlier_share=judgement.inlier_share,
             visible_share=judgement.visible_share,
-            cost=alignment.equations.mean_cost,
-            colour_error=alignment.model.colour_sigma,
+            cost=fit.equations.mean_cost,
+            colour_error=fit.model.colour_sigma,
             eigenvalues=judgement.eigenvalues,
-            gain=alignment.gain,
-            bias=alignment.bias,
+            gain=fit.gain,
+            bias=fit.bias,
             renders=refinement.renders,
             stages_ms=clock.stages_ms,
         )

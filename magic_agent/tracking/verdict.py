@@ -30,16 +30,14 @@ def judge(
     refinement: Refinement,
     *,
     previous_from_camera: NDArray[np.float64],
-    information: NDArray[np.float64],
     prior: NDArray[np.float64],
     config: LostConfig,
 ) -> Judgement:
     """Lost where the view does not fit, or the motion is impossible; degenerate where some
     direction is known less well from the images than from the motion prior."""
-    equations = refinement.alignment.equations
-    visible_share = equations.visible / refinement.alignment.pixels
-    inlier_share = equations.agreeing / max(equations.measured, 1e-9)
-    eigenvalues = relative_eigenvalues(information, prior)
+    fit = refinement.alignment.fits[0]
+    visible_share, inlier_share = fit.visible_share, fit.inlier_share
+    eigenvalues = relative_eigenvalues(refinement.alignment.information, prior)
     reason = _why_lost(
         frame,
         refinement,
@@ -87,7 +85,7 @@ def _why_lost(
         return f"only {visible_share:.0%} of the image shows the sub-map"
     if has_depth and inlier_share < config.min_inlier_share:
         return f"only {inlier_share:.0%} of the depths agree with the sub-map"
-    colour_error = refinement.alignment.model.colour_sigma
+    colour_error = refinement.alignment.fits[0].model.colour_sigma
     if has_colour and colour_error > config.max_colour_error:
         return f"colour residuals of {colour_error:.2f}"
     return ""

@@ -78,11 +78,11 @@ class ResidualModel:
     """Depth noise at zero range, metres."""
     k2_per_m: float = 0.002
     """Growth of depth noise with z^2, 1 / m."""
-    k_slope: float = 0.7
+    k_slope: float = 0.1
     """Sideways error of a depth pixel, in pixels; counts in proportion to the depth's gradient."""
-    colour_width: float = 3.0
+    colour_width: float = 4.0
     """Geman-McClure width of colour residuals, in standard deviations."""
-    depth_width: float = 3.0
+    depth_width: float = 4.0
     """Geman-McClure width of depth residuals, in standard deviations."""
     colour_weight: float = 1.0
     """Factor on colour information."""

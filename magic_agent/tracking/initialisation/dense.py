@@ -6,8 +6,10 @@ and the pyramids are those that the refinement needs anyway.
 
 from __future__ import annotations
 
+import numpy as np
+
 from magic_agent.tracking.config import GaussNewtonConfig
-from magic_agent.tracking.gauss_newton import GaussNewton, MotionPrior
+from magic_agent.tracking.gauss_newton import GaussNewton, MotionPrior, View
 from magic_agent.tracking.initialisation.base import InitialPose, Pose, checked
 from magic_agent.tracking.pyramid import keyframe_pyramid
 from magic_agent.tracking.pyramid_cache import PyramidCache
@@ -38,18 +40,18 @@ class Dense:
     ) -> InitialPose:
         """Alignment from the prediction; little agreement gives the prediction back."""
         image = self._pyramids.get(current)
-        reference = keyframe_pyramid(self._pyramids.get(previous), finest=_FINEST_LEVEL)
+        finest = min(_FINEST_LEVEL, len(image) - 1)
+        reference = keyframe_pyramid(self._pyramids.get(previous), finest=finest)
         solution = GaussNewton(self._config).align(
-            reference,
+            [View(reference, np.eye(4), finest=finest)],
             image,
-            reference_from_camera=predicted_previous_from_current,
+            anchor_from_camera=predicted_previous_from_current,
             prior=MotionPrior.around(predicted_previous_from_current, self._config),
-            finest=min(_FINEST_LEVEL, len(image) - 1),
+            finest=finest,
         )
-        equations = solution.equations
-        agreeing = equations.agreeing / max(equations.measured, 1.0)
+        agreeing = solution.fits[0].inlier_share
         if agreeing < _MIN_AGREEING:
             return InitialPose(predicted_previous_from_current, False, agreeing)
         return checked(
-            solution.reference_from_camera, predicted_previous_from_current, fitness=agreeing
+            solution.anchor_from_camera, predicted_previous_from_current, fitness=agreeing
         )
