@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magic_core.geometry import Camera
 
-_OPPOSITE_STEPS = (((0, -1), (0, 1)), ((-1, 0), (1, 0)), ((-1, -1), (1, 1)), ((-1, 1), (1, -1)))
+_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (rows, columns): along the image's four directions
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +24,8 @@ class Surface:
 def surface_of(depth: NDArray[np.float32], camera: Camera, *, jump: float = 0.03) -> Surface:
     """Normals and reliable pixels of an (h, w) depth image in metres.
 
-    `jump` is the relative step of inverse depth from a pixel to its neighbour that marks a
-    discontinuity. Inverse depth is affine over a plane, so a slanted wall stays below it.
+    `jump` is the relative step of inverse depth from a pixel to its neighbour that may mark a
+    discontinuity.
     """
     inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float32)
     return Surface(_normals(depth, inverse, camera), _reliable(inverse, jump))
@@ -35,19 +35,27 @@ def _reliable(inverse: NDArray[np.float32], jump: float) -> NDArray[np.bool_]:
     """Readings that do not float between a nearer and a farther surface.
 
     A flying pixel is a mixture over an edge: one neighbour is clearly nearer, the opposite one
-    clearly farther.
+    clearly farther, and beyond these neighbours the depth is flat again. On a slanted surface,
+    where inverse depth is affine, the slope goes on instead.
     """
-    padded = np.pad(inverse, 1, mode="edge")
-    height, width = inverse.shape
+    padded = np.pad(inverse, 2, mode="reflect", reflect_type="odd")
     flying = np.zeros(inverse.shape, dtype=bool)
-    for (y0, x0), (y1, x1) in _OPPOSITE_STEPS:
-        first = padded[1 + y0 : 1 + y0 + height, 1 + x0 : 1 + x0 + width]
-        second = padded[1 + y1 : 1 + y1 + height, 1 + x1 : 1 + x1 + width]
-        known = (first > 0) & (second > 0)
-        step_in, step_out = first - inverse, inverse - second
-        flying |= known & (np.minimum(step_in, step_out) > jump * inverse)
-        flying |= known & (np.maximum(step_in, step_out) < -jump * inverse)
+    for step in _STEPS:
+        before2, before, after, after2 = (_shifted(padded, step, n) for n in (-2, -1, 1, 2))
+        step_in, step_out = before - inverse, inverse - after
+        least = np.where(step_in * step_out > 0, np.minimum(abs(step_in), abs(step_out)), 0.0)
+        outside = np.maximum(abs(before2 - before), abs(after - after2))
+        across = 0.5 * abs(before - after)
+        known = (before > 0) & (after > 0)
+        flying |= known & (least > jump * inverse) & (across > 2.0 * outside)
     return (inverse > 0) & ~flying
+
+
+def _shifted(padded: NDArray[np.float32], step: tuple[int, int], count: int) -> NDArray[np.float32]:
+    """The image, padded by 2, as seen `count` steps further."""
+    height, width = padded.shape[0] - 4, padded.shape[1] - 4
+    row, column = 2 + count * step[0], 2 + count * step[1]
+    return padded[row : row + height, column : column + width]
 
 
 def _normals(
@@ -61,8 +69,10 @@ def _normals(
     known = (inverse > 0).astype(np.float32)
     weight = cv2.boxFilter(known, -1, (5, 5))
     smooth = cv2.boxFilter(inverse, -1, (5, 5)) / np.maximum(weight, 1e-6)
-    # Smoothing over an edge would tilt both sides: keep the raw value where they disagree.
-    smooth = np.where(np.abs(smooth - inverse) > 0.03 * inverse, inverse, smooth)
+    # Smoothing over an edge would tilt both sides: keep the raw value where they disagree. In gaps
+    # the smooth value stays, so that the rim of a hole is not taken for a cliff.
+    uneven = (inverse > 0) & (np.abs(smooth - inverse) > 0.03 * inverse)
+    smooth = np.where(uneven, inverse, smooth)
     nx = _rim_from_inside(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)) * camera.fx
     ny = _rim_from_inside(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)) * camera.fy
     rays = camera.rays()

@@ -36,6 +36,10 @@ class MergeConfig:
     """Weight of the depth loss."""
     regularisation_weight: float = 1.0
     """Weight of the scale regularisation."""
+    means_rate_m: float = 5e-4
+    """Adam step of the means in metres at the start; all steps shrink to `final_rate`."""
+    final_rate: float = 0.1
+    """Share of the learning rates that is left when the budget is spent."""
     threads: int = 0
     """Threads of the rasteriser; 0 takes its own default."""
     seed: int = 0

@@ -76,6 +76,8 @@ def completed_depth(view: View, rendered: RenderedView) -> NDArray[np.float32]:
     ).astype(np.float32)
     surface = surface_of(known, view.camera)
     solid = surface.reliable & (np.abs(surface.normals).sum(axis=-1) > 0)
+    # Normals at the rim of the known are one-sided: take planes from a few pixels further in.
+    solid = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8)).astype(bool)
     if not solid.any():
         return known
     nearest = _nearest_pixel(solid)

@@ -6,6 +6,7 @@ the mapping losses and removes what turned transparent.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud
-from magic_core.render import GaussianOptimiser, LossWeights, Rasteriser
+from magic_core.render import GaussianOptimiser, LearningRates, LossWeights, Rasteriser
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.contribution import best_contribution
 from magic_server.globalmap.fill import fill_measured, fill_unmeasured
@@ -110,7 +111,16 @@ class _Merge:
                 depth=self._config.depth_weight,
                 scale=self._config.regularisation_weight,
             ),
+            learning_rates=self._rates(0.0),
             threads=self._config.threads or None,
+        )
+
+    def _rates(self, progress: float) -> LearningRates:
+        """The learning rates after a share of the budget: they fall exponentially."""
+        share = self._config.final_rate**progress
+        base = LearningRates(means=self._config.means_rate_m)
+        return LearningRates(
+            *(share * getattr(base, field.name) for field in dataclasses.fields(base))
         )
 
     def _fill(self, optimiser: GaussianOptimiser) -> int:
@@ -138,6 +148,7 @@ class _Merge:
         order = VisitOrder(region_weights(self._views), self._rng)
         done, pruned, previous = 0, 0, float("inf")
         while done < self._config.iterations:
+            optimiser.learning_rates = self._rates(done / self._config.iterations)
             steps = min(max(len(self._views), 50), self._config.iterations - done)
             loss = float(np.mean([self._step(optimiser, order.next()) for _ in range(steps)]))
             done += steps

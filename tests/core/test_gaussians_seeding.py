@@ -68,6 +68,12 @@ def test_flying_pixels_are_unreliable_and_both_sides_of_the_edge_are_not():
     assert reliable[:, 32:].all()
 
 
+def test_a_floor_seen_at_a_grazing_angle_is_reliable_up_to_the_horizon():
+    down = CAMERA.rays()[..., 1]
+    depth = np.where(down > 0.05, 1.2 / np.maximum(down, 0.05), 0.0).astype(np.float32)
+    assert np.array_equal(surface_of(depth, CAMERA).reliable, depth > 0)
+
+
 def test_missing_readings_are_unreliable():
     depth = np.full((48, 64), 1.0, np.float32)
     depth[10:20, 10:20] = 0.0
