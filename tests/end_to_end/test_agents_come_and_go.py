@@ -3,9 +3,8 @@
 import asyncio
 import signal
 
-from tests.end_to_end.conftest import first_line, wait_for
-
 from magic_agent.client import MagicClient
+from tests.end_to_end.conftest import first_line, wait_for
 
 
 def agent_arguments(flat, target: str, name: str, out) -> list[str]:

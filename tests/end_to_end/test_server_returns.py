@@ -3,9 +3,8 @@
 import asyncio
 import signal
 
-from tests.end_to_end.conftest import first_line, wait_for
-
 from magic_agent.client import MagicClient
+from tests.end_to_end.conftest import first_line, wait_for
 
 
 def test_an_agent_outlives_its_server(flat, processes, tmp_path):
