@@ -21,6 +21,7 @@ from magic_agent.mapping.mapper import Mapper
 from magic_agent.odometry import ActiveSubmap, hand_over_edge
 from magic_agent.slam_config import SlamConfig
 from magic_agent.tracking import Tracker, TrackingResult
+from magic_agent.tracking.refinement import CloudView, ReferenceView
 from magic_core.data import Frame
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
@@ -48,6 +49,8 @@ class FrameResult:
     is_keyframe: bool
     finished: Submap | None
     """The sub-map that this frame closed."""
+    tracked: TrackingResult | None = None
+    """What the tracker said; None for the first frame of a chain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +101,11 @@ class LocalSlam:
             return self._first(frame)
         started = self._clock()
         tracked = self._track(frame, self._active)
+        if tracked.lost:
+            tracked = self._relocalised(frame) or tracked
         tracking_ms = 1e3 * (self._clock() - started)
         if tracked.lost:
-            return self._on_lost(frame, self._active, tracking_ms)
+            return self._on_lost(frame, self._active, tracked, tracking_ms)
         return self._on_tracked(frame, self._active, tracked, tracking_ms, mapping)
 
     def finish(self) -> Submap | None:
@@ -133,8 +138,25 @@ class LocalSlam:
             self._last.frame,
             anchor_from_previous=self._last.anchor_from_camera,
             anchor_from_before_previous=None if self._lost_in_a_row else self._before_last,
-            reference=self._mapper.render,
+            reference=self._reference(),
         )
+
+    def _reference(self) -> ReferenceView:
+        """The active sub-map as the tracker sees it; first-order solvers need gradients of it."""
+        if self._config.tracking.solver == "adam":
+            threads = self._config.threads or None
+            return CloudView(self._mapper.gaussians(), self._camera, threads=threads)
+        return self._mapper.render
+
+    def _relocalised(self, frame: Frame) -> TrackingResult | None:
+        """The pose of a lost frame found from the active sub-map's keyframes, if it is there."""
+        if not self._usable(frame):
+            return None
+        found = self._tracker.relocalise(frame, self._mapper.keyframes, reference=self._reference())
+        if found is not None:
+            log.info("agent %s: frame %d found again in its sub-map", self._agent, frame.index)
+            self._tracker.reset()
+        return found
 
     def _remember(self, frame: Frame, anchor_from_camera: Pose) -> None:
         """Note a frame that has a pose: the next one is tracked from here."""
@@ -171,16 +193,24 @@ class LocalSlam:
             mapping_ms=1e3 * (self._clock() - started),
             is_keyframe=is_keyframe,
             finished=finished,
+            tracked=tracked,
         )
 
-    def _on_lost(self, frame: Frame, active: ActiveSubmap, tracking_ms: float) -> FrameResult:
+    def _on_lost(
+        self, frame: Frame, active: ActiveSubmap, tracked: TrackingResult, tracking_ms: float
+    ) -> FrameResult:
         """Hold the last pose for a while; then close the sub-map and start one without odometry."""
         self._lost_in_a_row += 1
         usable = self._usable(frame)
         if not usable or self._lost_in_a_row < self._config.submap.max_lost_frames:
             active.append(frame, active.last_pose, lost=True)
             return self._result(
-                frame, active.index, active.last_pose, tracking_ms=tracking_ms, lost=True
+                frame,
+                active.index,
+                active.last_pose,
+                tracking_ms=tracking_ms,
+                lost=True,
+                tracked=tracked,
             )
         log.warning(
             "agent %s lost for %d frames: frame %d starts sub-map %d without odometry",
@@ -198,6 +228,7 @@ class LocalSlam:
             mapping_ms=1e3 * (self._clock() - started),
             is_keyframe=True,
             finished=finished,
+            tracked=tracked,
         )
 
     def _hand_over(self, frame: Frame, active: ActiveSubmap, edge: OdometryEdge) -> Submap:
@@ -263,6 +294,7 @@ class LocalSlam:
         lost: bool = False,
         is_keyframe: bool = False,
         finished: Submap | None = None,
+        tracked: TrackingResult | None = None,
     ) -> FrameResult:
         return FrameResult(
             frame_index=frame.index,
@@ -274,4 +306,5 @@ class LocalSlam:
             lost=lost,
             is_keyframe=is_keyframe,
             finished=finished,
+            tracked=tracked,
         )
