@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from magic_core.evaluation.accuracy import ground_truth_of, measure_trajectories
     from magic_core.evaluation.evaluate import evaluate_run
     from magic_core.evaluation.image_metrics import depth_l1, psnr, ssim
+    from magic_core.evaluation.report import write_report
 
 _HOMES = {
     "depth_l1": "image_metrics",
@@ -37,6 +38,7 @@ _HOMES = {
     "measure_trajectories": "accuracy",
     "psnr": "image_metrics",
     "ssim": "image_metrics",
+    "write_report": "report",
 }
 
 __all__ = [
@@ -58,6 +60,7 @@ __all__ = [
     "read_tum",
     "ssim",
     "write_kitti",
+    "write_report",
     "write_tum",
 ]
 

@@ -66,9 +66,10 @@ def _both_unit_range(rendered: Image, reference: Image) -> tuple[NDArray, NDArra
 
 
 def _unit_range(image: Image) -> NDArray[np.float64]:
+    values = np.empty(image.shape, np.float64)
+    values[:] = image
     if image.dtype == np.uint8:
-        return image.astype(np.float64) / 255.0
-    values = image.astype(np.float64)
+        values *= 1.0 / 255.0
     np.clip(values, 0.0, 1.0, out=values)
     return values
 

@@ -31,6 +31,8 @@ class View(Protocol):
     @property
     def alpha(self) -> NDArray[np.float32]: ...
     @property
+    def visible(self) -> NDArray[np.bool_]: ...
+    @property
     def expected_depth(self) -> NDArray[np.float32]: ...
 
 
@@ -77,8 +79,7 @@ def choose_views(
     chosen: list[ChosenView] = []
     for views in candidates.values():
         count = min(per_kind, len(views))
-        places = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
-        chosen += [views[place] for place in places]
+        chosen += [views[int((k + 0.5) * len(views) / count)] for k in range(count)]
     return chosen
 
 
