@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 POLL_S = 0.25
 _COPY_BYTES = 1 << 20
+_MERGE_PREFIX = "merge-"
 
 
 class GlobalMaps:
@@ -55,12 +56,20 @@ class GlobalMaps:
         self._config = config
         self._tasks = TaskScope("global maps")
         self._changed = asyncio.Event()
+        self._stopping = False
 
     async def start(self) -> None:
         """Begin again with every operation that a stopped server left open."""
+        for leftover in self._store.folder.glob(f"{_MERGE_PREFIX}*"):
+            await self._in_thread(shutil.rmtree, leftover, True)
         for operation in await self._store.maps.unfinished():
             session = await self._store.agents.session(operation.session)
             self._begin(operation.id, session, operation.request)
+
+    def dismiss_waiters(self) -> None:
+        """Answer those who wait for an operation now: the server is stopping."""
+        self._stopping = True
+        self._notify()
 
     async def close(self) -> None:
         """Stop; operations under way begin again after the next start."""
@@ -86,7 +95,7 @@ class GlobalMaps:
             changed = self._changed
             status = await self._store.maps.operation(session, operation)
             left = end - time.monotonic()
-            if status.done or left <= 0 or status.progress > above_progress:
+            if status.done or left <= 0 or status.progress > above_progress or self._stopping:
                 return status
             try:
                 async with asyncio.timeout(left):
@@ -124,7 +133,8 @@ class GlobalMaps:
             logger.warning("%s: merging with loops still open", session.name)
         snapshot = coordinator.board.snapshot
         chosen = chosen_poses(snapshot, request.component)
-        folder = Path(await self._in_thread(tempfile.mkdtemp, None, "merge-", self._store.folder))
+        root = self._store.folder
+        folder = Path(await self._in_thread(tempfile.mkdtemp, None, _MERGE_PREFIX, root))
         try:
             task = await self._task(coordinator, chosen, request, folder)
             outcome = await self._followed(operation, task)

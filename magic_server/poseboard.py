@@ -6,6 +6,7 @@ import asyncio
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
+from magic_core.errors import Unavailable
 from magic_core.wire import convert
 
 
@@ -16,6 +17,7 @@ class PoseBoard:
         self._snapshot = snapshot
         self._of_agent: dict[str, mapping_pb.PoseSnapshot] = {}
         self._changed = asyncio.Event()
+        self._closed = False
 
     @property
     def snapshot(self) -> mapping_pb.PoseSnapshot:
@@ -31,8 +33,12 @@ class PoseBoard:
         """Replace the solution and wake everyone who waits."""
         self._snapshot = snapshot
         self._of_agent.clear()
-        changed, self._changed = self._changed, asyncio.Event()
-        changed.set()
+        self._wake()
+
+    def close(self) -> None:
+        """Send everyone who waits away: the server is stopping."""
+        self._closed = True
+        self._wake()
 
     def of_agent(self, agent: str) -> mapping_pb.PoseSnapshot:
         """The newest solution with the poses of one agent only; made once per solution."""
@@ -41,6 +47,12 @@ class PoseBoard:
         return self._of_agent[agent]
 
     async def newer_than(self, revision: int) -> None:
-        """Wait until the solution's revision is above `revision`."""
-        while self.revision <= revision:
+        """Wait until the solution's revision is above `revision`; Unavailable when closed."""
+        while self.revision <= revision or self._closed:
+            if self._closed:
+                raise Unavailable("the server is stopping; watch again later")
             await self._changed.wait()
+
+    def _wake(self) -> None:
+        changed, self._changed = self._changed, asyncio.Event()
+        changed.set()

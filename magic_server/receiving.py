@@ -51,8 +51,8 @@ class SubmapReceiver:
         self._commits = TaskScope("commits")
 
     async def close(self) -> None:
-        """Wait for nothing further; commits under way were waited for by their calls."""
-        await self._commits.close()
+        """Wait for commits under way, whose callers may be gone already."""
+        await self._commits.finish()
 
     async def receive(
         self, messages: Messages, *, on_stored: Callable[[AgentRow, Vertex], None]

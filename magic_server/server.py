@@ -91,6 +91,8 @@ class Server:
         """Refuse new calls, let those under way finish, keep everything that was acknowledged."""
         if self._grpc is not None:
             await self._health.enter_graceful_shutdown()
+            self.sessions.dismiss_watchers()
+            self._maps.dismiss_waiters()
             await self._grpc.stop(self.config.listen.stop_grace_s)
             self._grpc = None
         await self._receiver.close()

@@ -32,6 +32,11 @@ class Sessions:
         for session in await self._store.agents.sessions():
             await self.coordinator(session)
 
+    def dismiss_watchers(self) -> None:
+        """End the streams that would otherwise go on for ever."""
+        for coordinator in self._coordinators.values():
+            coordinator.board.close()
+
     async def close(self) -> None:
         """Stop every coordinator."""
         for coordinator in self._coordinators.values():

@@ -29,6 +29,11 @@ class TaskScope:
         task.add_done_callback(self._forget)
         return task
 
+    async def finish(self) -> None:
+        """Take no more tasks and wait for the end of each."""
+        self._closed = True
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
     async def close(self) -> None:
         """Cancel every task and wait for the end of each."""
         self._closed = True

@@ -25,6 +25,7 @@ from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, make_submap, path
+from tests.waiting import eventually
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -45,7 +46,7 @@ def name_of(agent: int, index: int) -> str:
 def config(tmp_path_factory: pytest.TempPathFactory) -> ServerConfig:
     return ServerConfig(
         data_dir=tmp_path_factory.mktemp("mapping"),
-        listen=ListenConfig(port=0, stop_grace_s=2.0),
+        listen=ListenConfig(port=0, stop_grace_s=600.0),
         jobs=JobConfig(workers=2, niceness=0),
         loops=LoopConfig(top_k=2),
     )
@@ -190,9 +191,7 @@ async def test_wrong_descriptors_are_refused(mapped) -> None:
 async def test_a_watcher_sees_growing_revisions_up_to_the_newest(mapped) -> None:
     _, client, seen = mapped
     newest = (await client.get_corrected_poses("room")).revision
-    async with asyncio.timeout(20):
-        while not seen or seen[-1].revision < newest:
-            await asyncio.sleep(0.01)
+    await eventually(lambda: seen and seen[-1].revision >= newest)
     revisions = [snapshot.revision for snapshot in seen]
     assert revisions == sorted(set(revisions))
     assert [len(snapshot.poses) for snapshot in seen] == sorted(
@@ -207,11 +206,9 @@ async def test_a_late_watcher_gets_the_newest_at_once_and_none_twice(mapped) -> 
         assert snapshot.revision == newest.revision
         assert len(snapshot.poses) == SUBMAPS
         break
+    later = client.watch_corrected_poses("room", after_revision=newest.revision)
     with pytest.raises(TimeoutError):
-        async with asyncio.timeout(0.3):
-            after = newest.revision
-            async for _ in client.watch_corrected_poses("room", after_revision=after):
-                raise AssertionError("no newer revision exists")
+        await asyncio.wait_for(anext(later), 0.3)
 
 
 async def test_a_global_map_is_built_with_progress_and_read_in_every_format(
@@ -251,11 +248,12 @@ async def test_a_component_that_is_not_there_fails_the_operation(mapped) -> None
 
 
 async def test_a_server_started_again_knows_everything(mapped, config: ServerConfig) -> None:
-    first, client, _ = mapped
+    first, client, seen = mapped
     before = await client.get_corrected_poses("room")
     loops = await client.list_loops("room")
     listen = dataclasses.replace(config.listen, port=first.port)
-    await first.stop()
+    async with asyncio.timeout(60):  # far less than the grace: watchers are sent away
+        await first.stop()
     async with Server(dataclasses.replace(config, listen=listen)) as second:
         coordinator = await second.sessions.named("room")
         assert await coordinator.idle(timeout_s=60)
@@ -281,3 +279,5 @@ async def test_a_server_started_again_knows_everything(mapped, config: ServerCon
         assert final.revision > before.revision
         assert len(final.components) == 1
         assert final.components[0].id == before.components[0].id
+        # The watcher of the first server has found its way to the second.
+        await eventually(lambda: seen[-1].revision == final.revision)

@@ -31,6 +31,7 @@ from magic_core.wire.chunks import sha256
 from magic_server.config import ServerConfig, ServiceLimits
 from magic_server.server import Server
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.waiting import eventually
 
 
 @pytest.fixture
@@ -316,12 +317,9 @@ async def test_a_client_that_goes_away_leaves_nothing(
     async with grpc.aio.insecure_channel(server.address) as channel:
         call = mapping_grpc.MappingServiceStub(channel).SubmitSubmap(stream())
         await half.wait()
-        while not files_in(server):
-            await asyncio.sleep(0.01)
+        await eventually(lambda: files_in(server))
         call.cancel()
-    async with asyncio.timeout(10):
-        while files_in(server):
-            await asyncio.sleep(0.01)
+    await eventually(lambda: not files_in(server))
     await assert_nothing_is_left(server, registered)
 
 

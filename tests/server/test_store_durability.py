@@ -9,6 +9,7 @@ import os
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -19,6 +20,8 @@ from magic_core.wire.submap import decode_odometry
 from magic_server.store import BlobFolder, BlobWriter, NewSubmap, Store, Vertex
 from magic_server.store.blobs import translated_disk_errors
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+
+NO_DIGESTS = cast("tuple[str, ...]", (None,) * 5)  # what no transaction takes
 
 
 @pytest.fixture
@@ -98,7 +101,6 @@ def test_a_blob_that_does_not_fit_raises_resource_exhausted(tmp_path: Path) -> N
     os.dup2(os.open("/dev/full", os.O_WRONLY), blob._file.fileno())
     with pytest.raises(ResourceExhausted):
         blob.write(bytes(1 << 20))
-        blob.finish()
     blob.path.unlink()
 
 
@@ -143,8 +145,8 @@ async def test_a_transaction_that_fails_takes_its_blobs_back(store: Store) -> No
         made.header,
         made.header_sha256,
         made.gaussian_count,
-        (None,) * 5,
-        made.vertex,  # type: ignore[arg-type]
+        NO_DIGESTS,
+        made.vertex,
     )
     with pytest.raises(Exception, match="NOT NULL"):
         await store.add_submap(agent, broken, blobs, now=2.0)
@@ -162,8 +164,8 @@ async def test_a_blob_that_another_submap_holds_survives_a_failure(store: Store)
         again.header,
         again.header_sha256,
         0,
-        (None,) * 5,
-        again.vertex,  # type: ignore[arg-type]
+        NO_DIGESTS,
+        again.vertex,
     )
     with pytest.raises(Exception, match="NOT NULL"):
         await store.add_submap(second, broken, blobs, now=2.0)
