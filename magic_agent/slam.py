@@ -160,7 +160,9 @@ class LocalSlam:
 
     def _remember(self, frame: Frame, anchor_from_camera: Pose) -> None:
         """Note a frame that has a pose: the next one is tracked from here."""
-        self._before_last = self._last.anchor_from_camera if self._last is not None else None
+        # Over a lost stretch the step between the two poses is no frame-to-frame motion.
+        steady = self._last is not None and self._lost_in_a_row == 0
+        self._before_last = self._last.anchor_from_camera if self._last and steady else None
         self._last = _Tracked(frame, anchor_from_camera)
         self._lost_in_a_row = 0
 
