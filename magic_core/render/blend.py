@@ -42,14 +42,19 @@ from magic_core.render.simd import (
     claim,
     column_bits,
     fma,
+    fnma,
     load,
     maximum,
     minimum,
     prefetch,
+    read,
+    select,
     splat,
     store,
     store_block,
+    store_columns,
     trailing_zeros,
+    write,
     zero_unless,
 )
 from magic_core.render.vecmath import exp_of_8
@@ -78,13 +83,19 @@ def block_mask(records, o, centre_x, centre_y, pattern):
     edges nearest to it, at the point where it is stationary along that edge.
     """
     a, b, c = (
-        splat(records[o + layout.A]),
-        splat(records[o + layout.B]),
-        splat(records[o + layout.C]),
+        splat(read(records, o + layout.A)),
+        splat(read(records, o + layout.B)),
+        splat(read(records, o + layout.C)),
     )
-    shear_x, shear_y = splat(records[o + layout.SHEAR_X]), splat(records[o + layout.SHEAR_Y])
-    limit = splat(_THRESHOLD - _SLACK - records[o + layout.K])
-    du, dv = splat(centre_x - records[o + layout.U]), splat(centre_y - records[o + layout.V])
+    shear_x, shear_y = (
+        splat(read(records, o + layout.SHEAR_X)),
+        splat(read(records, o + layout.SHEAR_Y)),
+    )
+    limit = splat(_THRESHOLD - _SLACK - read(records, o + layout.K))
+    du, dv = (
+        splat(centre_x - read(records, o + layout.U)),
+        splat(centre_y - read(records, o + layout.V)),
+    )
     zero = splat(_ZERO)
     mask = np.uint32(0)
     for part in range(_PARTS):
@@ -110,20 +121,29 @@ def exponent(q0, qx, qy, a, b, c, x, y):
 
 
 @inlined
+def centred_polynomial(a, b, c, k, du, dv):
+    """(q0, qx, qy) of the exponent about a tile's centre, (du, dv) from the Gaussian's."""
+    x, y = a * du + b * dv, c * dv
+    return x * du + (y * dv + k), x + a * du, y + (b * du + y)
+
+
+@inlined
 def write_pair(scratch, p, records, o, centre_x, centre_y):
     """The polynomial and the colours of record o for one tile, to scratch[p:p + 10]."""
-    a, b, c = records[o + layout.A], records[o + layout.B], records[o + layout.C]
-    du, dv = centre_x - records[o + layout.U], centre_y - records[o + layout.V]
-    scratch[p] = (a * du + b * dv) * du + (c * dv * dv + records[o + layout.K])
-    scratch[p + 1] = _TWO * a * du + b * dv
-    scratch[p + 2] = _TWO * c * dv + b * du
-    scratch[p + 3] = a
-    scratch[p + 4] = b
-    scratch[p + 5] = c
-    scratch[p + 6] = records[o + layout.RED]
-    scratch[p + 7] = records[o + layout.GREEN]
-    scratch[p + 8] = records[o + layout.BLUE]
-    scratch[p + 9] = records[o + layout.DEPTH]
+    a, b = read(records, o + layout.A), read(records, o + layout.B)
+    c, k = read(records, o + layout.C), read(records, o + layout.K)
+    du, dv = centre_x - read(records, o + layout.U), centre_y - read(records, o + layout.V)
+    q0, qx, qy = centred_polynomial(a, b, c, k, du, dv)
+    write(scratch, p, q0)
+    write(scratch, p + 1, qx)
+    write(scratch, p + 2, qy)
+    write(scratch, p + 3, a)
+    write(scratch, p + 4, b)
+    write(scratch, p + 5, c)
+    write(scratch, p + 6, read(records, o + layout.RED))
+    write(scratch, p + 7, read(records, o + layout.GREEN))
+    write(scratch, p + 8, read(records, o + layout.BLUE))
+    write(scratch, p + 9, read(records, o + layout.DEPTH))
 
 
 @inlined
@@ -161,21 +181,22 @@ def _begin_tile(scratch, left, top, width, height):
 
 
 @inlined
-def _next_batch(read, end, kept, alive, records, lists, masks, centre_x, centre_y, pattern):
+def _next_batch(at, end, kept, alive, records, lists, masks, centre_x, centre_y, pattern):
     """Keep up to BATCH Gaussians that meet a living block, moving them to lists[kept:].
 
-    Returns (next to read, end of the kept ones).
+    Returns (next to read, end of the kept ones). lists has PREFETCH_AHEAD elements of any content
+    past its end.
     """
     full = kept + BATCH
-    while read < end and kept < full:
-        prefetch(records, RECORD * np.int64(lists[min(read + PREFETCH_AHEAD, end - 1)]))
-        g = lists[read]
+    while at < end and kept < full:
+        prefetch(records, RECORD * np.int64(read(lists, at + PREFETCH_AHEAD)))
+        g = read(lists, at)
         mask = block_mask(records, RECORD * np.int64(g), centre_x, centre_y, pattern) & alive
-        lists[kept] = g
-        masks[kept] = mask
+        write(lists, kept, g)
+        write(masks, kept, np.uint32(mask))
         kept += np.int64(mask != np.uint32(0))
-        read += 1
-    return read, kept
+        at += 1
+    return at, kept
 
 
 @inlined
@@ -196,17 +217,22 @@ def _blend_block(word, scratch, s, pattern, block):
         word &= word - np.uint64(1)
         p = _PAIRS + PAIR * i
         t = exponent(
-            splat(scratch[p]), splat(scratch[p + 1]), splat(scratch[p + 2]),
-            splat(scratch[p + 3]), splat(scratch[p + 4]), splat(scratch[p + 5]), x, y,
+            splat(read(scratch, p)), splat(read(scratch, p + 1)), splat(read(scratch, p + 2)),
+            splat(read(scratch, p + 3)), splat(read(scratch, p + 4)), splat(read(scratch, p + 5)),
+            x, y,
         )  # fmt: skip
-        counts = (t >= threshold) & (transmittance >= t_min)
-        weight = zero_unless(counts, minimum(exp_of_8(t), largest)) * transmittance
-        transmittance = transmittance - weight
-        red = fma(weight, splat(scratch[p + 6]), red)
-        green = fma(weight, splat(scratch[p + 7]), green)
-        blue = fma(weight, splat(scratch[p + 8]), blue)
-        depth = fma(weight, splat(scratch[p + 9]), depth)
-        reached |= np.uint64(bits(counts) != np.uint32(0)) << np.uint64(i)
+        drawn = t >= threshold
+        alpha = zero_unless(drawn, minimum(exp_of_8(t), largest))
+        # T waits only for one comparison and one product from the Gaussian before.
+        open_ = transmittance >= t_min
+        weight = zero_unless(open_, alpha * transmittance)
+        passed = fnma(alpha, transmittance, transmittance)
+        transmittance = select(open_, passed, transmittance)
+        red = fma(weight, splat(read(scratch, p + 6)), red)
+        green = fma(weight, splat(read(scratch, p + 7)), green)
+        blue = fma(weight, splat(read(scratch, p + 8)), blue)
+        depth = fma(weight, splat(read(scratch, p + 9)), depth)
+        reached |= np.uint64(bits(drawn & open_) != np.uint32(0)) << np.uint64(i)
     store(scratch, s, transmittance)
     store(scratch, s + LANES, red)
     store(scratch, s + 2 * LANES, green)
@@ -251,10 +277,12 @@ def blend(claimed, tiles, tiles_x, width, height, records, lists, starts, patter
     """Blend every tile.
 
     lists is reordered in place: the kept Gaussians of tile t move to its beginning,
-    kept_counts[t] says how many, masks[i] holds their blocks (0 where the tile had ended before).
+    kept_counts[t] says how many, masks[i] has the bits of the blocks where Gaussian lists[i]
+    reached a pixel. lists and masks have BATCH elements more than there are pairs.
     visible[g] is set to 1 for each Gaussian that reached a pixel.
     """
     scratch = layout_scratch(_SCRATCH)
+    hit_words = np.zeros(BLOCKS, np.uint64)
     while True:
         tile = claim(claimed, np.int64(1))
         if tile >= tiles:
@@ -262,17 +290,18 @@ def blend(claimed, tiles, tiles_x, width, height, records, lists, starts, patter
         left, top = TILE * (tile % tiles_x), TILE * (tile // tiles_x)
         centre_x, centre_y = f32(left) + TILE_CENTRE, f32(top) + TILE_CENTRE
         alive = _begin_tile(scratch, left, top, width, height)
-        read, end, kept = np.int64(starts[tile]), np.int64(starts[tile + 1]), np.int64(starts[tile])
-        while read < end and alive != np.uint32(0):
+        at, end, kept = np.int64(starts[tile]), np.int64(starts[tile + 1]), np.int64(starts[tile])
+        while at < end and alive != np.uint32(0):
             first = kept
-            read, kept = _next_batch(
-                read, end, kept, alive, records, lists, masks, centre_x, centre_y, pattern
+            at, kept = _next_batch(
+                at, end, kept, alive, records, lists, masks, centre_x, centre_y, pattern
             )
             for i in range(kept - first):
-                o = RECORD * np.int64(lists[first + i])
+                o = RECORD * np.int64(read(lists, first + i))
                 write_pair(scratch, _PAIRS + PAIR * i, records, o, centre_x, centre_y)
             reached = np.uint64(0)
             for block in range(BLOCKS):
+                hits = np.uint64(0)
                 if alive >> np.uint32(block) & np.uint32(1) != np.uint32(0):
                     word = _block_word(masks, first, kept - first, block)
                     if word != np.uint64(0):
@@ -280,8 +309,12 @@ def blend(claimed, tiles, tiles_x, width, height, records, lists, starts, patter
                         reached |= hits
                         if not goes_on:
                             alive &= ~(np.uint32(1) << np.uint32(block))
+                write(hit_words, block, hits)
+            for part in range(0, kept - first, LANES):
+                store_columns(masks, first + part, hit_words, part)
             while reached != np.uint64(0):
-                visible[lists[first + trailing_zeros(reached)]] = 1
+                g = np.int64(read(lists, first + trailing_zeros(reached)))
+                write(visible, g, np.uint8(1))
                 reached &= reached - np.uint64(1)
         kept_counts[tile] = kept - starts[tile]
         for block in range(BLOCKS):

@@ -22,6 +22,7 @@ import numpy as np
 from magic_core.render import layout
 from magic_core.render.blend import (
     PREFETCH_AHEAD,
+    centred_polynomial,
     exponent,
     inside_lanes,
     layout_scratch,
@@ -31,7 +32,7 @@ from magic_core.render.jit import inlined, kernel
 from magic_core.render.lanes import LANES
 from magic_core.render.layout import (
     BLOCKS,
-    CHUNK,
+    CHUNK_SHIFT,
     PIXEL_VECTORS,
     PIXELS,
     RECORD,
@@ -49,11 +50,13 @@ from magic_core.render.simd import (
     load_block,
     minimum,
     prefetch,
+    read,
     reciprocal,
     splat,
     store,
     store_sums10,
     trailing_zeros,
+    write,
     zero_unless,
 )
 from magic_core.render.vecmath import exp_of_8
@@ -62,12 +65,14 @@ from magic_core.render.vecmath import exp_of_8
 # centre, then red, green, blue, depth.
 PAIR_GRADIENT = 16
 
-# State of a block: T, remainder, gradients by red, green, blue, depth, alpha.
-_STATE = 7 * LANES
+# State of a block, in vectors: T, remainder, gradients by red, green, blue, depth, alpha, then the
+# constants x, y, x^2, x y, y^2 of its pixels, so that one address serves all.
+_GRADIENTS, _PIXELS, _VECTORS = 2, 7, 16
+_STATE = _VECTORS * LANES
 _PARTIAL = BLOCKS * _STATE  # two vectors to gather a block at the border of the image
 _SCRATCH = _PARTIAL + 2 * 16
 
-_ZERO, _ONE, _TWO = f32(0.0), f32(1.0), f32(2.0)
+_ZERO, _ONE = f32(0.0), f32(1.0)
 _THRESHOLD, _ALPHA_MAX, _T_MIN = (
     layout.LOG_THRESHOLD, layout.ALPHA_MAX, layout.TRANSMITTANCE_MIN
 )  # fmt: skip
@@ -100,32 +105,41 @@ def _begin_tile(scratch, left, top, width, height, image, gradient):
             g = _load_pixels(scratch, _PARTIAL, gradient, index, width, columns, rows)
             value = _load_pixels(scratch, _PARTIAL + 16, image, index, width, columns, rows)
             remainder = fma(g, value, remainder)
-            store(scratch, s + (2 + k) * LANES, g)
+            store(scratch, s + (_GRADIENTS + k) * LANES, g)
         store(scratch, s + LANES, remainder)
 
 
 @inlined
-def _pair_sums(mask, scratch, records, o, centre_x, centre_y, pattern, out, to):
-    """Walk the blocks of one pair and write its ten sums (moments about the tile's centre)."""
-    a, b, c = records[o + layout.A], records[o + layout.B], records[o + layout.C]
-    du, dv = centre_x - records[o + layout.U], centre_y - records[o + layout.V]
-    q0 = splat((a * du + b * dv) * du + (c * dv * dv + records[o + layout.K]))
-    qx, qy = splat(_TWO * a * du + b * dv), splat(_TWO * c * dv + b * du)
-    qa, qb, qc = splat(a), splat(b), splat(c)
-    red, green = splat(records[o + layout.RED]), splat(records[o + layout.GREEN])
-    blue, depth = splat(records[o + layout.BLUE]), splat(records[o + layout.DEPTH])
+def _copy_pixel_constants(scratch, pattern):
+    """Lay the constants of each block's pixels beside its state."""
+    for block in range(BLOCKS):
+        for k in range(5):
+            vector = load(pattern, PIXELS + block * PIXEL_VECTORS + k * LANES)
+            store(scratch, block * _STATE + (_PIXELS + k) * LANES, vector)
+
+
+@inlined
+def _pair_sums(mask, scratch, records, o, centre_x, centre_y, out, to):
+    """Walk the blocks of one pair and write its ten sums to out[to:to + 10]."""
+    a, b = read(records, o + layout.A), read(records, o + layout.B)
+    c, k = read(records, o + layout.C), read(records, o + layout.K)
+    du, dv = centre_x - read(records, o + layout.U), centre_y - read(records, o + layout.V)
+    q0, qx, qy = centred_polynomial(a, b, c, k, du, dv)
+    q0, qx, qy, qa, qb, qc = splat(q0), splat(qx), splat(qy), splat(a), splat(b), splat(c)
+    red, green = splat(read(records, o + layout.RED)), splat(read(records, o + layout.GREEN))
+    blue, depth = splat(read(records, o + layout.BLUE)), splat(read(records, o + layout.DEPTH))
     one, zero = splat(_ONE), splat(_ZERO)
     threshold, largest, t_min = splat(_THRESHOLD), splat(_ALPHA_MAX), splat(_T_MIN)
     m0, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     sum_red, sum_green, sum_blue, sum_depth = zero, zero, zero, zero
     while mask != np.uint64(0):
-        block = trailing_zeros(mask)
+        s = trailing_zeros(mask) * _STATE
         mask &= mask - np.uint64(1)
-        s, at = block * _STATE, PIXELS + block * PIXEL_VECTORS
-        t = exponent(q0, qx, qy, qa, qb, qc, load(pattern, at), load(pattern, at + LANES))
+        x, y = load(scratch, s + _PIXELS * LANES), load(scratch, s + (_PIXELS + 1) * LANES)
+        t = exponent(q0, qx, qy, qa, qb, qc, x, y)
         transmittance = load(scratch, s)
-        counts = (t >= threshold) & (transmittance >= t_min)
         unclamped = exp_of_8(t)
+        counts = (t >= threshold) & (transmittance >= t_min)
         alpha = zero_unless(counts, minimum(unclamped, largest))
         weight = alpha * transmittance
         g_red, g_green = load(scratch, s + 2 * LANES), load(scratch, s + 3 * LANES)
@@ -134,32 +148,29 @@ def _pair_sums(mask, scratch, records, o, centre_x, centre_y, pattern, out, to):
         value = fma(red, g_red, fma(green, g_green, value))
         share = weight * value
         remainder = load(scratch, s + LANES) - share
-        store(scratch, s, transmittance - weight)
+        store(scratch, s, fnma(alpha, transmittance, transmittance))
         store(scratch, s + LANES, remainder)
         change = fnma(remainder, alpha * reciprocal(one - alpha), share)
         change = zero_unless(unclamped < largest, change)
         m0 = m0 + change
-        mx = fma(change, load(pattern, at), mx)
-        my = fma(change, load(pattern, at + LANES), my)
-        mxx = fma(change, load(pattern, at + 2 * LANES), mxx)
-        mxy = fma(change, load(pattern, at + 3 * LANES), mxy)
-        myy = fma(change, load(pattern, at + 4 * LANES), myy)
+        mx = fma(change, x, mx)
+        my = fma(change, y, my)
+        mxx = fma(change, load(scratch, s + (_PIXELS + 2) * LANES), mxx)
+        mxy = fma(change, load(scratch, s + (_PIXELS + 3) * LANES), mxy)
+        myy = fma(change, load(scratch, s + (_PIXELS + 4) * LANES), myy)
         sum_red = fma(weight, g_red, sum_red)
         sum_green = fma(weight, g_green, sum_green)
         sum_blue = fma(weight, g_blue, sum_blue)
         sum_depth = fma(weight, g_depth, sum_depth)
-    store_sums10(out, to, m0, mx, my, mxx, mxy, myy, sum_red, sum_green, sum_blue, sum_depth)
-
-
-@inlined
-def _shift_moments(out, to, du, dv):
-    """Move the moments from the tile's centre to the Gaussian's: x <- x + du, y <- y + dv."""
-    m0, mx, my = out[to], out[to + 1], out[to + 2]
-    out[to + 3] += du * (_TWO * mx + du * m0)
-    out[to + 4] += du * my + dv * (mx + du * m0)
-    out[to + 5] += dv * (_TWO * my + dv * m0)
-    out[to + 1] = mx + du * m0
-    out[to + 2] = my + dv * m0
+    # Move the moments from the tile's centre to the Gaussian's: x <- x + du, y <- y + dv.
+    du, dv = splat(du), splat(dv)
+    moved_x, moved_y = fma(du, m0, mx), fma(dv, m0, my)
+    mxx = fma(du, mx + moved_x, mxx)
+    mxy = fma(du, my, fma(dv, moved_x, mxy))
+    myy = fma(dv, my + moved_y, myy)
+    store_sums10(
+        out, to, m0, moved_x, moved_y, mxx, mxy, myy, sum_red, sum_green, sum_blue, sum_depth
+    )
 
 
 @kernel
@@ -168,10 +179,10 @@ def blend_backward(claimed, tiles, tiles_x, width, height, records, record_ints,
                    pair_gradients, pair_written):  # fmt: skip
     """Fill the slots of all pairs that `blend` kept.
 
-    gradient is (5, h, w) flat like the image. The slot of (Gaussian, tile) is the Gaussian's first
-    slot plus the tile's number within the Gaussian's rectangle of tiles; pair_written is set there.
+    gradient is (5, h, w) flat like the image. pair_written is set for each slot that is filled.
     """
     scratch = layout_scratch(_SCRATCH)
+    _copy_pixel_constants(scratch, pattern)
     while True:
         tile = claim(claimed, np.int64(1))
         if tile >= tiles:
@@ -185,21 +196,18 @@ def blend_backward(claimed, tiles, tiles_x, width, height, records, record_ints,
         centre_x, centre_y = f32(left) + TILE_CENTRE, f32(top) + TILE_CENTRE
         _begin_tile(scratch, left, top, width, height, image, gradient)
         for i in range(begin, end):
-            prefetch(records, RECORD * np.int64(lists[min(i + PREFETCH_AHEAD, end - 1)]))
-            g = np.int64(lists[i])
+            prefetch(records, RECORD * np.int64(read(lists, i + PREFETCH_AHEAD)))
+            mask = np.uint64(read(masks, i))
+            if mask == np.uint64(0):
+                continue
+            g = np.int64(read(lists, i))
             o = RECORD * g
-            packed, first_row = record_ints[o + layout.COLUMNS], record_ints[o + layout.ROWS]
-            first_column = packed & 0xFFFF
-            across = (packed >> 16) - first_column + 1
-            slot = slot_starts[g // CHUNK] + record_ints[o + layout.SLOT]
-            slot += (row - (first_row & 0xFFFF)) * across + (column - first_column)
-            to = PAIR_GRADIENT * np.int64(slot)
+            slot = read(slot_starts, g >> CHUNK_SHIFT) + np.int64(
+                read(record_ints, o + layout.SLOT_BASE)
+            )
+            slot += row * np.int64(read(record_ints, o + layout.ACROSS)) + column
             _pair_sums(
-                np.uint64(masks[i]), scratch, records, o, centre_x, centre_y, pattern,
-                pair_gradients, to,
+                mask, scratch, records, o, centre_x, centre_y,
+                pair_gradients, PAIR_GRADIENT * slot,
             )  # fmt: skip
-            _shift_moments(
-                pair_gradients, to,
-                centre_x - records[o + layout.U], centre_y - records[o + layout.V],
-            )  # fmt: skip
-            pair_written[slot] = 1
+            write(pair_written, slot, np.uint8(1))

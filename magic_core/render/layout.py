@@ -43,10 +43,13 @@ TILE_CENTRE = f32((TILE - 1) / 2)
 # --- record fields ---
 RECORD = 16
 U, V, A, B, C, K, RED, GREEN, BLUE, DEPTH, SHEAR_Y, SHEAR_X = range(12)
-COLUMNS, ROWS, SLOT, RADIUS = range(12, 16)  # the first three hold int32 bit patterns
+RADIUS, SLOT, SLOT_BASE, ACROSS = range(12, 16)  # the last three hold int32 bit patterns
+# The gradient slots of a Gaussian's tiles are numbered row by row from SLOT on (within its chunk):
+# the slot of the tile (column, row) is SLOT_BASE + row ACROSS + column.
 
 # --- counters of one render, in RenderedView and the stage buffers ---
-CHUNK = 1024  # Gaussians whose visible ones are listed together
+CHUNK_SHIFT = 10
+CHUNK = 1 << CHUNK_SHIFT  # Gaussians whose visible ones are listed together
 
 # --- the pattern of pixels in a tile, one flat table that the blend kernels read ---
 BLOCK_LEFT = 0  # (BLOCKS,) left column of each block, relative to the tile's centre
@@ -67,8 +70,13 @@ def tile_pattern() -> np.ndarray:
 
 
 def aligned_zeros(count: int, dtype: type = np.float32) -> np.ndarray:
-    """A flat array of zeros that starts on a cache line."""
+    """A flat array of zeros that starts on a cache line.
+
+    np.empty, not np.zeros: numpy asks for huge pages for large blocks of the former only, and the
+    kernels' scattered accesses then miss the TLB far less.
+    """
     size = np.dtype(dtype).itemsize
-    raw = np.zeros(count * size + 64, np.uint8)
+    raw = np.empty(count * size + 64, np.uint8)
+    raw[:] = 0
     start = -raw.ctypes.data % 64
     return raw[start : start + count * size].view(dtype)

@@ -294,12 +294,11 @@ def project(claimed, means, quaternions, scales, opacities, colours, view, width
                 y0 = np.int32(scratch[_BOUNDS + 2 * LANES + lane])
                 y1 = np.int32(scratch[_BOUNDS + 3 * LANES + lane])
                 tiles = (x1 - x0 + 1) * (y1 - y0 + 1)
-                packed_columns, packed_rows = x0 | (x1 << 16), y0 | (y1 << 16)
-                record_ints[o + layout.COLUMNS] = packed_columns
-                record_ints[o + layout.ROWS] = packed_rows
                 record_ints[o + layout.SLOT] = slot
-                columns[g] = packed_columns
-                rows[g] = packed_rows
+                record_ints[o + layout.SLOT_BASE] = slot - y0 * (x1 - x0 + 1) - x0
+                record_ints[o + layout.ACROSS] = x1 - x0 + 1
+                columns[g] = x0 | (x1 << 16)
+                rows[g] = y0 | (y1 << 16)
                 touched[g] = tiles
                 slot += tiles
                 own_corners[y0 * stride + x0] += 1

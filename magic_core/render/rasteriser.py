@@ -15,7 +15,7 @@ from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
 from magic_core.render import layout, threads
 from magic_core.render.binning import bin_gaussians, chunk_slots, tile_starts
-from magic_core.render.blend import blend
+from magic_core.render.blend import BATCH, blend
 from magic_core.render.blend_backward import PAIR_GRADIENT, blend_backward
 from magic_core.render.lanes import LANES
 from magic_core.render.layout import CHUNK, RECORD, TILE, aligned_zeros
@@ -228,8 +228,8 @@ class Rasteriser:
     def _make_pair_room(self, pairs: int) -> None:
         if pairs > self._pairs_room or self._pairs_room == 0:
             self._pairs_room = pairs + pairs // 4 + 64
-            self.lists = np.zeros(self._pairs_room, np.int32)
-            self.masks = np.zeros(self._pairs_room + 64, np.uint32)
+            self.lists = aligned_zeros(self._pairs_room + BATCH, np.int32)
+            self.masks = aligned_zeros(self._pairs_room + BATCH, np.uint32)
             self.pair_gradients = np.zeros(0, np.float32)
 
     def _make_gradient_room(self, n: int) -> None:

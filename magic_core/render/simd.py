@@ -197,9 +197,17 @@ square_root, floor, ceil, absolute = (_define_unary(n) for n in ("sqrt", "floor"
 
 @intrinsic
 def reciprocal(typing, a):
-    """1 / a to about 1e-7 relative: an estimate and one Newton step where the machine has one."""
+    """1 / a, to 6e-5 relative at worst: AVX-512's estimate as it is, else estimate and Newton step.
+
+    For gradients only. The two Newton operations would cost a twentieth of the backward blend.
+    """
 
     def emit(context, builder, sig, args):
+        if LANES == 16:
+            everything = ir.Constant(ir.IntType(16), -1)
+            zero = ir.Constant(_floats, [0.0] * LANES)
+            name = "llvm.x86.avx512.rcp14.ps.512"
+            return _llvm(builder, name, _floats, args[0], zero, everything)
         one = ir.Constant(_floats, [1.0] * LANES)
         return builder.fdiv(one, args[0], flags=("fast",))
 
@@ -427,6 +435,53 @@ def store_block(typing, array, index, stride, vector):
         return context.get_dummy_value()
 
     return types.void(array, types.int64, types.int64, Vector), emit
+
+
+@intrinsic
+def read(typing, array, index):
+    """array[index] of a flat array without Python's rule for negative indices (and its cost)."""
+
+    def emit(context, builder, sig, args):
+        element = context.get_data_type(sig.return_type)
+        return builder.load(_pointer(context, builder, sig.args[0], args[0], args[1], element))
+
+    return array.dtype(array, types.int64), emit
+
+
+@intrinsic
+def write(typing, array, index, value):
+    """array[index] = value, likewise."""
+
+    def emit(context, builder, sig, args):
+        element = context.get_data_type(sig.args[2])
+        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1], element))
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, array.dtype), emit
+
+
+@intrinsic
+def store_columns(typing, array, index, words, shift):
+    """The transpose of `column_bits`: write LANES uint32 whose bit b is a bit of words[b].
+
+    Element array[index + i] gets bit shift + i of each of the uint64 words[0:256 / LANES].
+    """
+    blocks = 256 // LANES
+
+    def emit(context, builder, sig, args):
+        narrow = ir.IntType(LANES)
+        total = ir.Constant(_ints, [0] * LANES)
+        for block in range(blocks):
+            at = ir.Constant(_i64, block)
+            word = builder.load(_pointer(context, builder, sig.args[2], args[2], at, _i64))
+            lanes = builder.bitcast(builder.trunc(builder.lshr(word, args[3]), narrow), _bools)
+            bit = ir.Constant(_ints, [1 << block] * LANES)
+            total = builder.or_(total, builder.select(lanes, bit, ir.Constant(_ints, [0] * LANES)))
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _ints)
+        builder.store(total, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, words, types.int64), emit
 
 
 @intrinsic
