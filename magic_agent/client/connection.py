@@ -1,0 +1,124 @@
+"""One connection: its deadlines, which calls are tried again, and pages."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import grpc
+import grpc.aio
+from magicslam.v1 import global_map_service_pb2_grpc as map_grpc
+from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
+from magicslam.v1 import session_service_pb2_grpc as session_grpc
+
+from magic_core.errors import MagicError, Unavailable
+from magic_core.wire import SubmapEncoding, Transport, client_options, error_of
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class ClientConfig:
+    """Deadlines and retries of a client."""
+
+    connect_timeout_s: float = 20.0
+    """How long `connect` waits for the server."""
+    rpc_timeout_s: float = 20.0
+    """Deadline of one ordinary call, seconds."""
+    submit_timeout_s: float = 300.0
+    """Deadline of one attempt to send a sub-map, seconds."""
+    download_timeout_s: float = 600.0
+    """Deadline of one download, seconds."""
+    attempts: int = 5
+    """Times an idempotent call is tried while the server cannot be reached."""
+    backoff_s: float = 0.25
+    """Wait before the second attempt, seconds; doubles each time, with jitter."""
+    max_backoff_s: float = 10.0
+    """Longest wait between attempts, seconds."""
+    encoding: SubmapEncoding = field(default_factory=SubmapEncoding)
+    """How sub-maps become bytes."""
+    transport: Transport = field(default_factory=Transport)
+    """Keepalive and message limits."""
+
+
+class Connection:
+    """A channel to a server and what all calls over it share."""
+
+    def __init__(self, target: str, config: ClientConfig = ClientConfig()) -> None:
+        self.target = target
+        self.config = config
+        self._channel = grpc.aio.insecure_channel(target, client_options(config.transport))
+        self.mapping_stub = mapping_grpc.MappingServiceStub(self._channel)
+        self.map_stub = map_grpc.GlobalMapServiceStub(self._channel)
+        self.session_stub = session_grpc.SessionServiceStub(self._channel)
+
+    async def __aenter__(self) -> Self:
+        await self.connect()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def connect(self) -> None:
+        """Wait until the server answers; Unavailable when it does not in time."""
+        try:
+            async with asyncio.timeout(self.config.connect_timeout_s):
+                await self._channel.channel_ready()
+        except TimeoutError as error:
+            waited = self.config.connect_timeout_s
+            raise Unavailable(
+                f"no server answers at {self.target} within {waited:g} s; is `magic serve` running?"
+            ) from error
+
+    async def close(self) -> None:
+        """Close the connection; calls under way are cancelled."""
+        await self._channel.close(grace=None)
+
+    async def idempotent(self, method: Callable[..., Awaitable[_T]], request: Any) -> _T:
+        """The answer of a call that may be repeated: it gets a deadline and is tried again."""
+
+        async def attempt() -> _T:
+            return await method(request, timeout=self.config.rpc_timeout_s)
+
+        return await self.retried(attempt)
+
+    async def retried(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
+        """The result of an attempt, made again while the server cannot be reached."""
+        failures = 0
+        while True:
+            try:
+                return await attempt()
+            except grpc.RpcError as failure:
+                await self.pause_or_raise(error_of(failure), failures)
+            failures += 1
+
+    async def pause_or_raise(self, error: MagicError, failures: int) -> None:
+        """Sleep before the next attempt, or raise when trying again is no use."""
+        if not isinstance(error, Unavailable) or failures + 1 >= self.config.attempts:
+            raise error
+        pause = min(self.config.backoff_s * 2**failures, self.config.max_backoff_s)
+        await asyncio.sleep(pause * random.uniform(0.5, 1.0))
+
+    async def pages(self, method: Callable[..., Awaitable[_T]], request: Any) -> AsyncIterator[_T]:
+        """Every page of a list call."""
+        while True:
+            page: Any = await self.idempotent(method, request)
+            yield page
+            if not page.next_page_token:
+                return
+            request.page_token = page.next_page_token
+
+
+def new_id() -> str:
+    """A request id that nobody else chooses."""
+    return uuid.uuid4().hex

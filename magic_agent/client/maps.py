@@ -1,0 +1,149 @@
+"""Calls of GlobalMapService: merging as operations, and reading maps."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from magicslam.v1 import global_map_service_pb2 as map_pb
+
+from magic_agent.client.connection import Connection, new_id
+from magic_core.errors import CorruptData, DeadlineExceeded, MagicError
+from magic_core.gaussians import GaussianCloud, codec
+from magic_core.wire import check_chunk, convert, names, records
+from magic_core.wire.chunks import sha256
+from magic_core.wire.errors import error_class
+
+
+class MapCalls(Connection):
+    """Builds and reads global maps."""
+
+    async def build_global_map(
+        self,
+        session: str,
+        *,
+        component: str | None = None,
+        coarse_only: bool = False,
+        drain_timeout_s: float = 0.0,
+        timeout_s: float = 3600.0,
+        progress: Callable[[float, str], None] | None = None,
+        request_id: str | None = None,
+    ) -> records.GlobalMapInfo:
+        """Merge the sub-maps of a component (the largest by default) and wait for the map.
+
+        `progress` is called with (share done, stage). Raises the error the merge ended with.
+        """
+        status = await self.start_global_map(
+            session,
+            component=component,
+            coarse_only=coarse_only,
+            drain_timeout_s=drain_timeout_s,
+            request_id=request_id,
+        )
+        status = await self.wait_operation(status, timeout_s=timeout_s, progress=progress)
+        if status.result is None:
+            raise _error_of_operation(status)
+        return status.result
+
+    async def start_global_map(
+        self,
+        session: str,
+        *,
+        component: str | None = None,
+        coarse_only: bool = False,
+        drain_timeout_s: float = 0.0,
+        request_id: str | None = None,
+    ) -> records.OperationStatus:
+        """Start to merge and return at once with the operation to follow."""
+        request = map_pb.BuildGlobalMapRequest(
+            session=names.session_name(session),
+            request_id=request_id or new_id(),
+            component=component or "",
+            coarse_only=coarse_only,
+            drain_timeout_s=drain_timeout_s,
+        )
+        answer = await self.idempotent(self.map_stub.BuildGlobalMap, request)
+        return convert.operation_from_proto(answer.operation)
+
+    async def wait_operation(
+        self,
+        operation: records.OperationStatus,
+        *,
+        timeout_s: float = 3600.0,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> records.OperationStatus:
+        """Wait until an operation is done; DeadlineExceeded when it is not in time."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not operation.done:
+                    if progress is not None:
+                        progress(operation.progress, operation.stage)
+                    operation = await self._wait_step(operation)
+        except TimeoutError as error:
+            raise DeadlineExceeded(
+                f"{operation.name} is at {operation.progress:.0%} after {timeout_s:g} s; it goes on"
+            ) from error
+        if progress is not None:
+            progress(operation.progress, operation.stage)
+        return operation
+
+    async def get_operation(self, name: str) -> records.OperationStatus:
+        """The state of an operation."""
+        answer = await self.idempotent(
+            self.map_stub.GetOperation, map_pb.GetOperationRequest(name=name)
+        )
+        return convert.operation_from_proto(answer.operation)
+
+    async def list_operations(self, session: str) -> tuple[records.OperationStatus, ...]:
+        """The operations of a session, oldest first."""
+        request = map_pb.ListOperationsRequest(session=names.session_name(session))
+        pages = self.pages(self.map_stub.ListOperations, request)
+        return tuple([convert.operation_from_proto(o) async for p in pages for o in p.operations])
+
+    async def get_global_map(self, name: str) -> GaussianCloud:
+        """The Gaussians of a map, float32 bit for bit, in its component's world frame.
+
+        `name` is a map's resource name or `sessions/{s}` for the session's newest.
+        """
+        _, data = await self.download_global_map(name, format="lossless")
+        return await asyncio.to_thread(codec.decode, data)
+
+    async def download_global_map(
+        self, name: str, *, format: records.MapFormat = "ply"
+    ) -> tuple[records.GlobalMapInfo, bytes]:
+        """A map's description and the bytes of its file."""
+        request = map_pb.GetGlobalMapRequest(name=name, format=convert.map_format_to_proto(format))
+
+        async def attempt() -> tuple[map_pb.GlobalMapHeader, bytes]:
+            timeout = self.config.download_timeout_s
+            header, pieces = None, []
+            async for message in self.map_stub.GetGlobalMap(request, timeout=timeout):
+                if message.WhichOneof("payload") == "header":
+                    header = message.header
+                else:
+                    check_chunk(message.chunk)
+                    pieces.append(message.chunk.data)
+            if header is None:
+                raise CorruptData(f"the download of {name} has no header")
+            return header, b"".join(pieces)
+
+        header, data = await self.retried(attempt)
+        if await asyncio.to_thread(sha256, data) != header.sha256:
+            raise CorruptData(f"{name}: {len(data)} bytes received, their SHA-256 does not match")
+        return convert.map_from_proto(header.map), data
+
+    async def _wait_step(self, operation: records.OperationStatus) -> records.OperationStatus:
+        wait_s = min(10.0, self.config.rpc_timeout_s / 2)
+        request = map_pb.WaitOperationRequest(
+            name=operation.name, timeout_s=wait_s, above_progress=operation.progress
+        )
+        answer = await self.idempotent(self.map_stub.WaitOperation, request)
+        return convert.operation_from_proto(answer.operation)
+
+
+def _error_of_operation(status: records.OperationStatus) -> MagicError:
+    """The error a failed operation ended with, of the class that the server raised."""
+    if status.error is None:
+        return MagicError(f"{status.name} ended without a result")
+    kind = error_class(status.error.reason, status.error.code)
+    return kind(status.error.message)

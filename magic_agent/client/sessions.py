@@ -1,0 +1,119 @@
+"""Calls of SessionService: reading, listing and deleting what is stored."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterable
+
+from magicslam.v1 import session_service_pb2 as session_pb
+from magicslam.v1 import submap_pb2
+
+from magic_agent.client.connection import Connection
+from magic_core.errors import CorruptData
+from magic_core.submap import Submap
+from magic_core.wire import (
+    ChunkCursor,
+    EncodedSubmap,
+    check_chunk,
+    convert,
+    decode_submap,
+    names,
+    records,
+)
+from magic_core.wire.chunks import sha256
+
+
+class SessionCalls(Connection):
+    """Sessions, their agents and their sub-maps."""
+
+    async def get_session(self, session: str) -> records.SessionInfo:
+        """A session."""
+        request = session_pb.GetSessionRequest(name=names.session_name(session))
+        answer = await self.idempotent(self.session_stub.GetSession, request)
+        return convert.session_from_proto(answer.session)
+
+    async def list_sessions(self) -> tuple[records.SessionInfo, ...]:
+        """Every session, oldest first."""
+        pages = self.pages(self.session_stub.ListSessions, session_pb.ListSessionsRequest())
+        return tuple([convert.session_from_proto(s) async for p in pages for s in p.sessions])
+
+    async def delete_session(self, session: str) -> None:
+        """Delete a session. Raises NotSupported on a server that does not offer it yet."""
+        request = session_pb.DeleteSessionRequest(name=names.session_name(session))
+        await self.idempotent(self.session_stub.DeleteSession, request)
+
+    async def get_agent(self, session: str, agent: str) -> records.AgentInfo:
+        """An agent."""
+        request = session_pb.GetAgentRequest(name=names.agent_name(session, agent))
+        answer = await self.idempotent(self.session_stub.GetAgent, request)
+        return convert.agent_from_proto(answer.agent)
+
+    async def list_agents(self, session: str) -> tuple[records.AgentInfo, ...]:
+        """The agents of a session, oldest first."""
+        request = session_pb.ListAgentsRequest(session=names.session_name(session))
+        pages = self.pages(self.session_stub.ListAgents, request)
+        return tuple([convert.agent_from_proto(a) async for p in pages for a in p.agents])
+
+    async def delete_agent(self, session: str, agent: str) -> None:
+        """Delete an agent. Raises NotSupported on a server that does not offer it yet."""
+        request = session_pb.DeleteAgentRequest(name=names.agent_name(session, agent))
+        await self.idempotent(self.session_stub.DeleteAgent, request)
+
+    async def get_submap(self, name: str) -> tuple[records.SubmapInfo, submap_pb2.SubmapHeader]:
+        """A sub-map's summary, and its header as submitted."""
+        request = session_pb.GetSubmapRequest(name=name)
+        answer = await self.idempotent(self.session_stub.GetSubmap, request)
+        return convert.submap_info_from_proto(answer.submap), answer.header
+
+    async def list_submaps(
+        self, session: str, *, agent: str | None = None
+    ) -> tuple[records.SubmapInfo, ...]:
+        """The sub-maps of a session, or of one agent, in order of arrival."""
+        parent = names.agent_name(session, agent) if agent else names.session_name(session)
+        request = session_pb.ListSubmapsRequest(parent=parent)
+        pages = self.pages(self.session_stub.ListSubmaps, request)
+        return tuple([convert.submap_info_from_proto(s) async for p in pages for s in p.submaps])
+
+    async def delete_submap(self, name: str) -> None:
+        """Delete a sub-map. Raises NotSupported on a server that does not offer it yet."""
+        request = session_pb.DeleteSubmapRequest(name=name)
+        await self.idempotent(self.session_stub.DeleteSubmap, request)
+
+    async def download_submap(self, name: str) -> Submap:
+        """A stored sub-map, decoded from the bytes that were submitted."""
+        encoded = await self.download_encoded(name)
+        return await asyncio.to_thread(decode_submap, encoded.header, encoded.blobs)
+
+    async def download_encoded(self, name: str) -> EncodedSubmap:
+        """A stored sub-map as bytes, every blob checked against its digest."""
+        request = session_pb.DownloadSubmapRequest(name=name)
+
+        async def attempt() -> EncodedSubmap:
+            timeout = self.config.download_timeout_s
+            return await _collect(self.session_stub.DownloadSubmap(request, timeout=timeout), name)
+
+        return await self.retried(attempt)
+
+
+async def _collect(
+    call: AsyncIterable[session_pb.DownloadSubmapResponse], name: str
+) -> EncodedSubmap:
+    """The header and blobs of a download; CorruptData when anything is missing or differs."""
+    header: submap_pb2.SubmapHeader | None = None
+    cursor = ChunkCursor(())
+    blobs: list[bytearray] = []
+    async for message in call:
+        if message.WhichOneof("payload") == "header":
+            header = message.header
+            cursor = ChunkCursor(tuple(blob.length for blob in header.blobs))
+            blobs = [bytearray() for _ in header.blobs]
+        else:
+            check_chunk(message.chunk)
+            cursor.advance(message.chunk)
+            blobs[message.chunk.blob_index] += message.chunk.data
+    if header is None or not cursor.done:
+        raise CorruptData(f"the download of {name} ended early; fetch it again")
+    data = tuple(bytes(blob) for blob in blobs)
+    if any(sha256(blob) != info.sha256 for blob, info in zip(data, header.blobs, strict=True)):
+        raise CorruptData(f"a blob of {name} does not match its SHA-256")
+    return EncodedSubmap(header, data)
