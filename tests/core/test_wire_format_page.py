@@ -1,4 +1,4 @@
-"""docs/wire-format.md is enough: a decoder written from the page alone reads what the codec writes."""
+"""docs/wire-format.md is enough: a decoder made from the page alone reads what the codec writes."""
 
 from __future__ import annotations
 
