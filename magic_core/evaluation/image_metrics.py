@@ -59,7 +59,9 @@ def depth_l1(
     return float(np.abs(rendered[counts] - reference[counts]).mean())
 
 
-def _both_unit_range(rendered: Image, reference: Image) -> tuple[NDArray, NDArray]:
+def _both_unit_range(
+    rendered: Image, reference: Image
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if rendered.shape != reference.shape:
         raise InvalidInput.field("rendered", f"shape {rendered.shape} against {reference.shape}")
     return _unit_range(rendered), _unit_range(reference)
@@ -67,9 +69,7 @@ def _both_unit_range(rendered: Image, reference: Image) -> tuple[NDArray, NDArra
 
 def _unit_range(image: Image) -> NDArray[np.float64]:
     values = np.empty(image.shape, np.float64)
-    values[:] = image
-    if image.dtype == np.uint8:
-        values *= 1.0 / 255.0
+    np.divide(image, 255.0 if image.dtype == np.uint8 else 1.0, out=values)
     np.clip(values, 0.0, 1.0, out=values)
     return values
 
@@ -77,4 +77,4 @@ def _unit_range(image: Image) -> NDArray[np.float64]:
 def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
     blurred = cv2.GaussianBlur(np.ascontiguousarray(image), (_WINDOW, _WINDOW), _SIGMA)
     margin = _WINDOW // 2
-    return np.asarray(blurred)[margin:-margin, margin:-margin]
+    return np.asarray(blurred, np.float64)[margin:-margin, margin:-margin]
