@@ -8,15 +8,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.pyramid import Pyramid
-from magic_core.geometry import se3
-from magic_core.render.linearisation import ResidualModel, estimate_scales, linearise
+from magic_core.geometry import Camera, se3
+from magic_core.render.linearisation import (
+    NormalEquations,
+    ResidualModel,
+    estimate_scales,
+    linearise,
+)
 
 _FAR_M = 100.0
-_ITERATIONS = 12
+_ITERATIONS = 8
+_CONVERGED_PIXELS = 0.05
+_MIN_WIDTH = 40  # pixels
 _MODEL = ResidualModel(depth_weight=0.0, gate=1e9, colour_width=5.0)
 
 
@@ -32,27 +40,78 @@ class RotationFit:
 def align_rotation(
     previous: Pyramid, current: Pyramid, *, previous_from_current: NDArray[np.float64]
 ) -> RotationFit:
-    """Turn the given motion so that the coarsest images of two pyramids agree best."""
-    image, camera = current.levels[-1], current.cameras[-1]
-    reference = _far_reference(previous.levels[-1])
-    turn = se3.from_rotation_translation(previous_from_current[:3, :3], np.zeros(3))
-    pose = {"camera": camera, "camera_from_reference": se3.inverse(turn)}
-    model = estimate_scales(reference, image, model=_MODEL, **pose)
-    equations = linearise(reference, image, model=model, **pose)
-    first_cost = equations.mean_cost
-    for _ in range(_ITERATIONS):
-        hessian = equations.hessian[3:6, 3:6] + 1e-6 * np.eye(3)
-        step = np.concatenate([np.zeros(3), np.linalg.solve(hessian, -equations.gradient[3:6])])
-        trial = se3.exp(step) @ turn
-        trial_equations = linearise(
-            reference, image, camera=camera, camera_from_reference=se3.inverse(trial), model=model
-        )
-        if trial_equations.mean_cost >= equations.mean_cost:
-            break
-        turn, equations = trial, trial_equations
+    """Turn the given motion so that tiny images of two frames agree best.
+
+    Two starts are refined, the given rotation and the one that shifts the images onto each other
+    (phase correlation, which knows no local minima); the better result counts.
+    """
+    level = _level(current)
+    image, camera = current.levels[level], current.cameras[level]
+    reference = _far_reference(previous.levels[level])
+    given = se3.from_rotation_translation(previous_from_current[:3, :3], np.zeros(3))
+    model = estimate_scales(
+        reference, image, camera=camera, camera_from_reference=se3.inverse(given), model=_MODEL
+    )
+    problem = _Problem(reference, image, camera, model)
+    fits = [problem.solve(given), problem.solve(shifting_rotation(reference, image, camera))]
+    turn, cost = min(fits, key=lambda fit: fit[1])
     result = previous_from_current.copy()
     result[:3, :3] = turn[:3, :3]
-    return RotationFit(result, first_cost, equations.mean_cost)
+    return RotationFit(result, problem.linearise(given).mean_cost, cost)
+
+
+def shifting_rotation(
+    reference: NDArray[np.float32], image: NDArray[np.float32], camera: Camera
+) -> NDArray[np.float64]:
+    """(4, 4) previous_from_current that turns about x and y as the whole image seems to shift."""
+    before, after = reference[:3].mean(axis=0), image[..., :3].mean(axis=-1)
+    window = cv2.createHanningWindow((camera.width, camera.height), cv2.CV_32F)
+    (shift_u, shift_v), _ = cv2.phaseCorrelate(
+        np.ascontiguousarray(before), np.ascontiguousarray(after), window
+    )
+    about_x, about_y = np.arctan2(shift_v, camera.fy), -np.arctan2(shift_u, camera.fx)
+    return se3.exp([0.0, 0.0, 0.0, about_x, about_y, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Two tiny images whose rotation is sought."""
+
+    reference: NDArray[np.float32]
+    image: NDArray[np.float32]
+    camera: Camera
+    model: ResidualModel
+
+    def linearise(self, turn: NDArray[np.float64]) -> NormalEquations:
+        return linearise(
+            self.reference,
+            self.image,
+            camera=self.camera,
+            camera_from_reference=se3.inverse(turn),
+            model=self.model,
+            threads=1,
+        )
+
+    def solve(self, turn: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Gauss-Newton on the rotation alone: (rotation, cost) where it stops improving."""
+        equations = self.linearise(turn)
+        for _ in range(_ITERATIONS):
+            hessian = equations.hessian[3:6, 3:6] + 1e-6 * np.eye(3)
+            step = np.concatenate([np.zeros(3), np.linalg.solve(hessian, -equations.gradient[3:6])])
+            trial = se3.exp(step) @ turn
+            trial_equations = self.linearise(trial)
+            if trial_equations.mean_cost >= equations.mean_cost:
+                break
+            turn, equations = trial, trial_equations
+            if np.linalg.norm(step) * self.camera.fx < _CONVERGED_PIXELS:
+                break
+        return turn, equations.mean_cost
+
+
+def _level(pyramid: Pyramid) -> int:
+    """The coarsest level that is still wide enough to be shifted."""
+    wide = [i for i, camera in enumerate(pyramid.cameras) if camera.width >= _MIN_WIDTH]
+    return wide[-1] if wide else 0
 
 
 def _far_reference(image: NDArray[np.float32]) -> NDArray[np.float32]:
