@@ -34,6 +34,8 @@ class ClientConfig:
     """Deadline of one attempt to send a sub-map, seconds."""
     download_timeout_s: float = 600.0
     """Deadline of one download, seconds."""
+    watch_timeout_s: float = 3600.0
+    """A watch is opened again after this long, seconds; nothing is missed."""
     attempts: int = 5
     """Times an idempotent call is tried while the server cannot be reached."""
     backoff_s: float = 0.25

@@ -10,6 +10,7 @@ import grpc
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_agent.client.connection import Connection, new_id
+from magic_core.errors import DeadlineExceeded
 from magic_core.geometry import Camera
 from magic_core.submap import Descriptor, Submap
 from magic_core.wire import (
@@ -161,17 +162,22 @@ class MappingCalls(Connection):
                 agent=_agent_or_empty(session, agent),
                 after_revision=after_revision,
             )
-            call = self.mapping_stub.WatchCorrectedPoses(request)
+            timeout = self.config.watch_timeout_s
+            call = self.mapping_stub.WatchCorrectedPoses(request, timeout=timeout)
             try:
                 async for answer in call:
                     failures = 0
                     after_revision = answer.snapshot.revision
                     yield convert.snapshot_from_proto(answer.snapshot)
             except grpc.RpcError as failure:
-                await self.pause_or_raise(error_of(failure), failures)
+                error = error_of(failure)
+                if not isinstance(error, DeadlineExceeded):
+                    await self.pause_or_raise(error, failures)
+                    failures += 1
+            else:
+                await asyncio.sleep(self.config.backoff_s)
             finally:
                 call.cancel()
-            failures += 1
 
     async def get_trajectory(self, session: str, agent: str) -> tuple[records.TrajectoryPart, ...]:
         """The corrected camera pose of every frame of an agent, one part per sub-map."""

@@ -12,7 +12,7 @@ from magicslam.v1 import global_map_service_pb2 as map_pb
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import session_service_pb2 as session_pb
 
-from magic_core.wire import geometry, names, records
+from magic_core.wire import geometry, records
 
 _K = TypeVar("_K")
 _V = TypeVar("_V")
@@ -363,7 +363,6 @@ def localization_from_proto(message: mapping_pb.LocalizeResponse) -> records.Loc
 
 
 def _pose_to_proto(pose: records.CorrectedPose) -> mapping_pb.CorrectedPose:
-    names.parse_submap(pose.submap, field="submap")
     return mapping_pb.CorrectedPose(
         submap=pose.submap,
         component=pose.component,

@@ -105,8 +105,7 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             case _:
                 raise InvalidInput.field("query", "give `submap` or `descriptor`")
         return mapping_pb.QueryLoopsResponse(
-            candidates=[convert.loop_to_proto(loop) for loop in candidates],
-            revision=coordinator.board.revision,
+            candidates=await self._loop_messages(candidates), revision=coordinator.board.revision
         )
 
     async def ListLoops(  # noqa: N802
@@ -119,7 +118,7 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             limit=page_limit(request.page_size, default=500),
         )
         return mapping_pb.ListLoopsResponse(
-            candidates=[convert.loop_to_proto(loop) for loop in found],
+            candidates=await self._loop_messages(found),
             next_page_token=token_of(following),
             revision=coordinator.board.revision,
         )
@@ -162,6 +161,14 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         self, request: mapping_pb.LocalizeRequest, context: Context
     ) -> mapping_pb.LocalizeResponse:
         raise NotSupported("this server does not localise images yet")
+
+    async def _loop_messages(
+        self, loops: list[records.LoopCandidate]
+    ) -> list[mapping_pb.LoopCandidate]:
+        """Messages of many candidates, made on a thread: a thousand take longer than 50 ms."""
+        return await asyncio.get_running_loop().run_in_executor(
+            self._threads, lambda: [convert.loop_to_proto(loop) for loop in loops]
+        )
 
     async def _coordinator(self, session: str) -> SessionCoordinator:
         return await self._sessions.named(names.parse_session(session, field="session"))

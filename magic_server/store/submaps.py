@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import sqlalchemy as sa
-from magicslam.v1 import submap_pb2
 
 from magic_core.errors import NotFound
 from magic_core.submap import Descriptor, OdometryEdge
@@ -105,22 +104,6 @@ class SubmapTable:
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
         return [_vertex(session, row) for row in rows]
-
-    async def headers(
-        self, session: SessionRow, agent: str
-    ) -> list[tuple[str, submap_pb2.SubmapHeader]]:
-        """(name, header) of every sub-map of an agent by index."""
-        query = sa.select(submaps.c.number, submaps.c.header).join(agents)
-        query = query.where(submaps.c.session_id == session.id, agents.c.name == agent)
-        async with self._database.read() as connection:
-            rows = (await connection.execute(query.order_by(submaps.c.number))).all()
-        return [
-            (
-                names.submap_name(session.name, agent, row.number),
-                submap_pb2.SubmapHeader.FromString(row.header),
-            )
-            for row in rows
-        ]
 
     async def page(
         self, session: SessionRow, *, agent: str | None = None, after: int = 0, limit: int = 100

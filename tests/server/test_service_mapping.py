@@ -211,6 +211,23 @@ async def test_a_late_watcher_gets_the_newest_at_once_and_none_twice(mapped) -> 
         await asyncio.wait_for(anext(later), 0.3)
 
 
+async def test_a_watch_that_reaches_its_deadline_goes_on_and_repeats_nothing(mapped) -> None:
+    server, client, _ = mapped
+    newest = (await client.get_corrected_poses("room")).revision
+    seen: list[int] = []
+    async with MagicClient(server.address, ClientConfig(watch_timeout_s=0.1)) as short:
+
+        async def watch() -> None:
+            async for snapshot in short.watch_corrected_poses("room"):
+                seen.append(snapshot.revision)
+
+        watcher = asyncio.create_task(watch())
+        await asyncio.wait([watcher], timeout=0.6)
+        assert not watcher.done()
+        watcher.cancel()
+    assert seen == [newest]
+
+
 async def test_a_global_map_is_built_with_progress_and_read_in_every_format(
     mapped, tmp_path: Path
 ) -> None:
