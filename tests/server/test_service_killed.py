@@ -58,7 +58,7 @@ async def test_what_was_acknowledged_survives_kill_and_nothing_is_there_twice(
         for i in range(SUBMAPS)
     ]
     acknowledged: set[str] = set()
-    for _ in range(3):
+    for _ in range(2):
         process, address = await start(tmp_path)
         async with MagicClient(address) as client:
             await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
@@ -76,7 +76,7 @@ async def test_what_was_acknowledged_survives_kill_and_nothing_is_there_twice(
         stored = [info.name for info in await client.list_submaps("room")]
         assert len(stored) == len(set(stored)) < SUBMAPS
         assert acknowledged <= set(stored)
-        assert len(acknowledged) >= 4
+        assert len(acknowledged) >= 3
         for submap in submaps[: len(stored)]:
             found = await client.download_encoded(submap.header.name)
             assert (found.header, found.blobs) == (submap.header, submap.blobs)
