@@ -17,11 +17,14 @@ if TYPE_CHECKING:
         StepReport,
     )
     from magic_core.render.rasteriser import Gradients, Rasteriser, RenderedView
+    from magic_core.render.warmup import WarmUpReport, warm_up
 
 _HOMES = {
     "GaussianTensors": "api",
     "Rendering": "api",
     "render": "api",
+    "WarmUpReport": "warmup",
+    "warm_up": "warmup",
     "GaussianOptimiser": "optimiser",
     "LearningRates": "optimiser",
     "LossWeights": "optimiser",
@@ -41,7 +44,9 @@ __all__ = [
     "RenderedView",
     "Rendering",
     "StepReport",
+    "WarmUpReport",
     "render",
+    "warm_up",
 ]
 
 

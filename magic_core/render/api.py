@@ -17,7 +17,6 @@ from magic_core.geometry import Camera
 from magic_core.render.cuda import render_cuda
 from magic_core.render.rasteriser import Rasteriser
 from magic_core.render.reference import render_reference
-from magic_core.render.threads import default_threads
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -179,8 +178,8 @@ class _Lease:
 
     def __init__(self, threads: int | None) -> None:
         with self._lock:
-            self.rasteriser = self._spare.pop() if self._spare else Rasteriser(1)
-        self.rasteriser.threads = threads if threads is not None else default_threads()
+            self.rasteriser = self._spare.pop() if self._spare else Rasteriser()
+        self.rasteriser.use_threads(threads)
 
     def __del__(self) -> None:
         with self._lock:

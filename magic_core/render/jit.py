@@ -54,7 +54,24 @@ class _KernelCacheImpl(caching.CompileResultCacheImpl):
 
 
 class _KernelCache(caching.FunctionCache):
+    """numba's cache, saying what is compiled: it takes seconds that a user would wonder about."""
+
     _impl_class = _KernelCacheImpl
+    _announced = False
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            if not _KernelCache._announced:
+                logger.info("compiling kernels for this processor, once; about half a minute")
+                _KernelCache._announced = True
+            self._started = time.perf_counter()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        super().save_overload(sig, data)
+        name = self._py_func.__name__
+        logger.info("compiled %s in %.1f s", name, time.perf_counter() - self._started)
 
 
 def kernel(function: Callable) -> Any:

@@ -5,7 +5,9 @@ project -> sort -> bin -> blend, and for gradients blend backward -> project bac
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,17 +78,28 @@ class Gradients:
 class Rasteriser:
     """Renders clouds and takes gradients; holds the buffers between both, so use one per thread.
 
-    `threads` is how many cores one call may use (default: `threads.default_threads()`). Results do
-    not depend on it.
+    `threads` is how many cores one call may use (None: this process's fair share, see
+    `threads.default_threads`). Results do not depend on it. `stage_ms` tells how long each stage of
+    the last calls took.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        self.threads = threads if threads is not None else _default_threads()
+        self._threads = threads
+        self.stage_ms: dict[str, float] = {}
         self._pattern = layout.tile_pattern()
         self._gaussians_room = 0
         self._pairs_room = 0
         self._tiles_room = 0
         self._parameters: tuple[Float32, ...] | None = None
+
+    @property
+    def threads(self) -> int:
+        """Cores that the next call uses."""
+        return self._threads if self._threads is not None else threads.default_threads()
+
+    def use_threads(self, count: int | None) -> None:
+        """Set the number of cores; None for the fair share."""
+        self._threads = count
 
     def render(
         self, cloud: GaussianCloud, camera: Camera, world_from_camera: ArrayLike
@@ -145,24 +158,28 @@ class Rasteriser:
         n, camera = len(self._parameters[3]), self._camera
         self._make_gradient_room(n)
         self.pair_written[: self._slots] = 0
-        threads.run(
+        self._run(
             blend_backward,
             (self._tiles, self._tiles_x, camera.width, camera.height, self.records,
              self.record_ints, self.lists, self.starts, self.kept, self.masks, self.slot_starts,
              self._pattern, self.image.reshape(-1),
              np.ascontiguousarray(gradient, np.float32).reshape(-1),
              self.pair_gradients, self.pair_written),
-            threads=self.threads,
         )  # fmt: skip
-        threads.run(
+        self._run(
             project_backward,
             (*self._parameters, self._view, self.touched, self.record_ints, self.slot_starts,
              self.pair_gradients, self.pair_written, *self.d_parameters, self._chunk_pose),
-            threads=self.threads,
         )  # fmt: skip
         # exp(xi) on the right of world_from_camera is exp(-xi) on the left of its inverse.
         self.d_pose = -self._chunk_pose[: self._chunks].sum(axis=0)
         return n
+
+    def _run(self, kernel: Any, arguments: tuple) -> None:
+        """Run one stage on this rasteriser's threads and note its time."""
+        start = time.perf_counter()
+        threads.run(kernel, arguments, threads=self.threads)
+        self.stage_ms[kernel.__name__] = (time.perf_counter() - start) * 1e3
 
     def _project(self, parameters: tuple[Float32, ...]) -> None:
         self.corners[:] = 0
@@ -171,13 +188,15 @@ class Rasteriser:
             self.records, self.record_ints, self.columns, self.rows, self.touched,
             self.keys, self.ids, self.chunks, self.corners,
         )  # fmt: skip
-        threads.run(project, arguments, threads=self.threads)
+        self._run(project, arguments)
         self.culled_not_finite = int(self.chunks[2 : 3 * self._chunks : 3].sum())
 
     def _sort_and_bin(self) -> None:
+        start = time.perf_counter()
         result, count = sort_by_depth(
             self.chunks, self._chunks, self.keys, self.ids, self.key_buffers, self.id_buffers
         )
+        self.stage_ms["sort_by_depth"] = (time.perf_counter() - start) * 1e3
         pairs = tile_starts(self.corners, self._tiles_x, self._tiles_y, self.starts)
         self._slots = chunk_slots(self.chunks, self._chunks, self.slot_starts)
         self._make_pair_room(int(pairs))
@@ -185,7 +204,7 @@ class Rasteriser:
             self.threads, self.id_buffers[result], count, self.columns, self.rows,
             self._tiles_x, self._tiles_y, self.starts, self.lists,
         )  # fmt: skip
-        threads.run(bin_gaussians, arguments, threads=self.threads)
+        self._run(bin_gaussians, arguments)
 
     def _blend(self) -> None:
         self.visible[:] = 0
@@ -194,7 +213,7 @@ class Rasteriser:
             self._tiles, self._tiles_x, camera.width, camera.height, self.records, self.lists,
             self.starts, self._pattern, self.image.reshape(-1), self.masks, self.kept, self.visible,
         )  # fmt: skip
-        threads.run(blend, arguments, threads=self.threads)
+        self._run(blend, arguments)
 
     def _make_room(self, n: int, camera: Camera) -> None:
         """Grow the buffers that depend on the number of Gaussians or the image's size."""
@@ -244,10 +263,6 @@ class Rasteriser:
 
 def _flat(array: Float32) -> Float32:
     return np.ascontiguousarray(array, np.float32).reshape(-1)
-
-
-def _default_threads() -> int:
-    return threads.default_threads()
 
 
 def _check_size(camera: Camera) -> None:

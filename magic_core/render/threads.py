@@ -9,24 +9,44 @@ any number of callers may share the helpers.
 
 from __future__ import annotations
 
+import math
 import os
+import tempfile
 import threading
+import time
 from collections.abc import Callable
+from pathlib import Path
 from queue import SimpleQueue
+from typing import TextIO
 
 import numpy as np
 
 from magic_core.errors import ConfigError
 
+try:
+    import fcntl
+except ImportError:  # no file locks on this system: every process counts itself alone
+    fcntl = None
+
+
+_SHARE_LASTS_S = 2.0
+
 
 def default_threads() -> int:
-    """`MAGIC_THREADS`, else the cores this process may use."""
+    """`MAGIC_THREADS`, else this process's fair share of the cores it may use.
+
+    The share is counted anew every two seconds: when several agents render on one machine, each
+    takes its part of the cores, and the last one left has them all.
+    """
     setting = os.environ.get("MAGIC_THREADS")
-    if setting is None:
-        return available_cores()
-    if not setting.isdecimal() or int(setting) < 1:
-        raise ConfigError.field("MAGIC_THREADS", f"{setting!r}: expected a whole number >= 1")
-    return int(setting)
+    if setting is not None:
+        if not setting.isdecimal() or int(setting) < 1:
+            raise ConfigError.field("MAGIC_THREADS", f"{setting!r}: expected a whole number >= 1")
+        return int(setting)
+    if time.monotonic() - _share.counted_at > _SHARE_LASTS_S:
+        _share.threads = max(1, available_cores() // rendering_processes())
+        _share.counted_at = time.monotonic()
+    return _share.threads
 
 
 def available_cores() -> int:
@@ -34,6 +54,53 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def rendering_processes() -> int:
+    """How many processes of this user render on this machine now, this one included.
+
+    Each holds a lock on a file of its own, which the system releases however the process ends.
+    """
+    if fcntl is None:
+        return 1
+    try:
+        folder = _registry_folder()
+        if _share.lock is None:
+            _share.lock = open(folder / str(os.getpid()), "w")  # noqa: SIM115 - held until the end
+            fcntl.flock(_share.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return max(1, sum(_is_held(path) for path in folder.iterdir()))
+    except OSError:
+        return 1
+
+
+def _registry_folder() -> Path:
+    folder = Path(tempfile.gettempdir()) / f"magic-slam-{os.getuid()}" / "rendering"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a living process holds the file's lock; files of ended ones are removed."""
+    assert fcntl is not None
+    with open(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    path.unlink(missing_ok=True)
+    return False
+
+
+class _Share:
+    """What this process knows of its share."""
+
+    def __init__(self) -> None:
+        self.threads = 1
+        self.counted_at = -math.inf
+        self.lock: TextIO | None = None
+
+
+_share = _Share()
 
 
 class _Job:
@@ -108,14 +175,14 @@ class _Helpers:
 _helpers = _Helpers()
 
 
-def _forget_helpers() -> None:
-    """In a forked child the threads of the parent do not exist: begin afresh."""
-    global _helpers
-    _helpers = _Helpers()
+def _begin_afresh() -> None:
+    """In a forked child the parent's threads do not exist, and its lock is not the child's."""
+    global _helpers, _share
+    _helpers, _share = _Helpers(), _Share()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_helpers)
+    os.register_at_fork(after_in_child=_begin_afresh)
 
 
 def run(kernel: Callable, arguments: tuple, *, threads: int) -> None:
