@@ -45,6 +45,7 @@ class AdamRefiner:
         anchor_from_camera: Pose,
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
+        initialised: bool = False,
         clock: StageClock,
     ) -> Refinement:
         """The pose after all steps, by the sub-map alone; its fit is that of a last render."""

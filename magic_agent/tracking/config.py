@@ -22,13 +22,15 @@ class GaussNewtonConfig:
     """Pyramid levels, the full image included; coarse to fine."""
     finest_level: int = 0
     """Level at which to stop; 0 is the full image."""
+    initialised_level: int = 1
+    """Level at which refinement begins after a successful registration to the previous frame."""
     iterations: tuple[int, ...] = (4, 5, 6, 8)
     """Most iterations per level, full image first; the last number serves all coarser levels."""
     renders: int = 2
     """Most renders of the sub-map per frame."""
     rerender_pixels: float = 3.0
     """Render again where the solution lies farther than this from the pose of the last render."""
-    converged_pixels: float = 0.02
+    converged_pixels: float = 0.03
     """A level is done when a step moves the image by less than this, in pixels of that level."""
     photometric: bool = True
     """Estimate gain and bias of each frame."""

@@ -37,9 +37,6 @@ class DifferentiableView(Protocol):
         ...
 
 
-_FINE_LEVEL = 1  # after the first render only this level and finer ones are solved again
-
-
 class CloudView:
     """A cloud of Gaussians as a reference view with gradients: the sub-map for the Adam solver."""
 
@@ -75,9 +72,14 @@ class Refiner(Protocol):
         anchor_from_camera: Pose,
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
+        initialised: bool = False,
         clock: StageClock,
     ) -> Refinement:
-        """Refine a first estimate of `anchor_from_camera`."""
+        """Refine a first estimate of `anchor_from_camera`.
+
+        keyframes: further views to align with. initialised: the estimate comes from images, not
+        from a prediction, and is good to a pixel or two.
+        """
         ...
 
 
@@ -95,6 +97,7 @@ class GaussNewtonRefiner:
         anchor_from_camera: Pose,
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
+        initialised: bool = False,
         clock: StageClock,
     ) -> Refinement:
         """The pose of the minimum near the given one, which is also the motion prior."""
@@ -105,7 +108,8 @@ class GaussNewtonRefiner:
             with clock.stage("render"):
                 rendered = reference(pose)
             with clock.stage("refinement"):
-                coarsest = len(image) - 1 if count == 1 else min(len(image) - 1, _FINE_LEVEL)
+                fine = count > 1 or initialised
+                coarsest = min(len(image) - 1, config.initialised_level if fine else len(image))
                 pyramid = view_pyramid(
                     rendered.image,
                     camera=image.cameras[0],

@@ -25,6 +25,7 @@ _FAR_M = 100.0
 _ITERATIONS = 8
 _CONVERGED_PIXELS = 0.05
 _MIN_WIDTH = 40  # pixels
+_EXPECTED_PIXELS = 2.0  # a smaller surprise is within reach of the coarse-to-fine alignment
 _MODEL = ResidualModel(depth_weight=0.0, gate=1e9, colour_width=5.0)
 
 
@@ -39,22 +40,25 @@ class RotationFit:
 
 def align_rotation(
     previous: Pyramid, current: Pyramid, *, previous_from_current: NDArray[np.float64]
-) -> RotationFit:
+) -> RotationFit | None:
     """Turn the given motion so that tiny images of two frames agree best.
 
-    Two starts are refined, the given rotation and the one that shifts the images onto each other
-    (phase correlation, which knows no local minima); the better result counts.
+    Phase correlation, which knows no local minima, tells how the images are shifted. None where
+    that is what the given motion expects; otherwise both rotations are refined and the better one
+    counts.
     """
     level = _level(current)
     image, camera = current.levels[level], current.cameras[level]
     reference = _far_reference(previous.levels[level])
     given = se3.from_rotation_translation(previous_from_current[:3, :3], np.zeros(3))
+    shifted = shifting_rotation(reference, image, camera)
+    if se3.rotation_angle(se3.inverse(given) @ shifted) * camera.fx < _EXPECTED_PIXELS:
+        return None
     model = estimate_scales(
         reference, image, camera=camera, camera_from_reference=se3.inverse(given), model=_MODEL
     )
     problem = _Problem(reference, image, camera, model)
-    fits = [problem.solve(given), problem.solve(shifting_rotation(reference, image, camera))]
-    turn, cost = min(fits, key=lambda fit: fit[1])
+    turn, cost = min((problem.solve(start) for start in (given, shifted)), key=lambda fit: fit[1])
     result = previous_from_current.copy()
     result[:3, :3] = turn[:3, :3]
     return RotationFit(result, problem.linearise(given).mean_cost, cost)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magic_agent.tracking.config import TrackingConfig
 from magic_agent.tracking.gauss_newton import MotionPrior
-from magic_agent.tracking.initialisation import make_initialiser
+from magic_agent.tracking.initialisation import InitialPose, make_initialiser
 from magic_agent.tracking.keyframe_window import KeyframeWindow
 from magic_agent.tracking.pyramid_cache import PyramidCache
 from magic_agent.tracking.refinement import (
@@ -91,9 +91,10 @@ class Tracker:
         refinement = self._refiner.refine(
             frame,
             image,
-            anchor_from_camera=anchor_from_previous @ start,
+            anchor_from_camera=anchor_from_previous @ start.previous_from_current,
             reference=reference,
             keyframes=self._window.views(anchor_from_previous),
+            initialised=start.ok and self._config.initialisation != "constant_velocity",
             clock=clock,
         )
         result = self._result(
@@ -143,22 +144,22 @@ class Tracker:
             refine=lambda pose: self.refine(frame, anchor_from_camera=pose, reference=reference),
         )
 
-    def _start(self, frame: Frame, previous: Frame, predicted: Pose) -> Pose:
-        """previous_from_current before refinement."""
+    def _start(self, frame: Frame, previous: Frame, predicted: Pose) -> InitialPose:
+        """The motion before refinement."""
         if self._config.rotation_prealignment:
             fit = align_rotation(
                 self._pyramids.get(previous),
                 self._pyramids.get(frame),
                 previous_from_current=predicted,
             )
-            if fit.cost_after < _TURN_GAIN * fit.cost_before:
+            if fit is not None and fit.cost_after < _TURN_GAIN * fit.cost_before:
                 predicted = fit.previous_from_current
         initial = self._initialiser.estimate(
             previous, frame, camera=self._camera, predicted_previous_from_current=predicted
         )
         if not initial.ok:
             logger.debug("frame %d: initialisation failed, using the prediction", frame.index)
-        return initial.previous_from_current
+        return initial
 
     def _result(
         self,

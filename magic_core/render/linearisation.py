@@ -30,6 +30,7 @@ grows with z^2 (structured light, stereo) and with the slope of the surface:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -49,6 +50,7 @@ _COLUMNS = _UNKNOWNS + 1  # the residual itself is the last column of the Jacobi
 # Sums behind the 9 x 9 Gram matrix: cost, then soft counts of the pixels that are visible in both
 # views, of those with two depths, and of those whose depths agree.
 _COST, _SUMS = _COLUMNS * _COLUMNS, 4
+_UPPER = np.triu(np.ones((_COLUMNS, _COLUMNS), bool))
 
 _BLOCK_ROWS = 16
 _WORTH_SHARING = 10_000  # pixels; smaller images are done before a second thread wakes up
@@ -94,10 +96,6 @@ class ResidualModel:
     """Depth residuals within this many standard deviations count as agreeing."""
     depth_step: float = 0.05
     """Neighbouring depths that differ by more than this share of the depth are an edge: unused."""
-
-    def scaled(self, *, colour_sigma: float, depth_sigma: float) -> ResidualModel:
-        """The same model with scales measured on the data."""
-        return replace(self, colour_sigma=colour_sigma, depth_sigma=depth_sigma)
 
     def with_gate(self, gate: float) -> ResidualModel:
         """The same model with another inlier gate, in standard deviations."""
@@ -152,20 +150,17 @@ def linearise(
     height, width = reference.shape[1:]
     blocks = np.zeros((-(-(height - 2) // _BLOCK_ROWS), _COST + _SUMS))
     packed = _packed(camera, camera_from_reference, gain, bias)
-    if threads is None:
+    if height * width < _WORTH_SHARING:
+        threads = 1
+    elif threads is None:
         threads = thread_pool.default_threads()
-    thread_pool.run(
-        _sum_blocks,
-        (reference, image, *packed, _packed_model(model), blocks),
-        threads=threads if height * width >= _WORTH_SHARING else 1,
-    )
+    arguments = (reference, image, *packed, _packed_model(model), blocks)
+    thread_pool.run(_sum_blocks, arguments, threads=threads)
     sums = blocks.sum(axis=0)
-    gram = sums[:_COST].reshape(_COLUMNS, _COLUMNS)
-    gram = np.triu(gram) + np.triu(gram, 1).T
+    upper = sums[:_COST].reshape(_COLUMNS, _COLUMNS)
+    gram = np.where(_UPPER, upper, upper.T)
     return NormalEquations(
-        gram[:_UNKNOWNS, :_UNKNOWNS],
-        gram[:_UNKNOWNS, _UNKNOWNS],
-        *(float(value) for value in sums[_COST:]),
+        gram[:_UNKNOWNS, :_UNKNOWNS], gram[:_UNKNOWNS, _UNKNOWNS], *sums[_COST:].tolist()
     )
 
 
@@ -178,7 +173,7 @@ def estimate_scales(
     model: ResidualModel,
     gain: float = 1.0,
     bias: float = 0.0,
-    samples: int = 4096,
+    samples: int = 2000,
 ) -> ResidualModel:
     """Replace the model's sigmas by 1.4826 x the median absolute residual at this pose.
 
@@ -186,11 +181,12 @@ def estimate_scales(
     that a few perfect or a few absurd pixels cannot make all others worthless.
     """
     height, width = reference.shape[1:]
-    rows = np.linspace(1, height - 2, max(4, min(height - 2, samples // width))).astype(np.int64)
+    step = max(1, round((height - 2) * width / samples))
     packed = _packed(camera, camera_from_reference, gain, bias)
-    errors = _sample_rows(np.unique(rows), reference, image, *packed, _packed_model(model))
+    errors = _sample_rows(1 + step // 2, step, reference, image, *packed, _packed_model(model))
     colour, depth = errors[0][errors[0] >= 0.0], errors[1][errors[1] >= 0.0]
-    return model.scaled(
+    return replace(
+        model,
         colour_sigma=_sigma(colour, 0.004, 0.5, otherwise=model.colour_sigma),
         depth_sigma=_sigma(depth, 0.2, 50.0, otherwise=model.depth_sigma),
     )
@@ -199,7 +195,9 @@ def estimate_scales(
 def _sigma(absolute: Float32, low: float, high: float, *, otherwise: float) -> float:
     if len(absolute) < 32:
         return otherwise
-    return float(np.clip(1.4826 * np.median(absolute), low, high))
+    middle = len(absolute) // 2
+    median = float(np.partition(absolute, middle)[middle])
+    return min(max(1.4826 * median, low), high)
 
 
 def _packed(
@@ -208,13 +206,19 @@ def _packed(
     """(intrinsics, camera_from_reference rows, its inverse's rows, photometric) as float32."""
     inverse = se3.inverse(camera_from_reference)
     return (
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+        _packed_camera(camera),
         np.ascontiguousarray(camera_from_reference[:3], np.float32).reshape(12),
         np.ascontiguousarray(inverse[:3], np.float32).reshape(12),
         np.array([gain, bias], np.float32),
     )
 
 
+@lru_cache(maxsize=64)
+def _packed_camera(camera: Camera) -> Float32:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+
+
+@lru_cache(maxsize=64)
 def _packed_model(model: ResidualModel) -> Float32:
     return np.array(
         [
@@ -270,13 +274,17 @@ def _sum_rows(first, last, reference, image, intrinsics, pose, inverse, photomet
 
 
 @njit(**_KERNEL)
-def _sample_rows(rows, reference, image, intrinsics, pose, inverse, photometric, model):
-    """(2, rows * w) absolute residuals: mean colour, and depth in model deviations; -1 = none."""
+def _sample_rows(first, step, reference, image, intrinsics, pose, inverse, photometric, model):
+    """(2, n) absolute residuals of every step-th row: mean colour, and depth in model deviations.
+
+    -1 stands for none.
+    """
     inner = reference.shape[2] - 1
     work = np.zeros(_WORK, np.float32)
-    errors = np.full((2, len(rows), inner), np.float32(-1.0))
-    for r in range(len(rows)):
-        row = rows[r]
+    rows = (reference.shape[1] - 2 - first) // step + 1
+    errors = np.full((2, rows, inner), np.float32(-1.0))
+    for r in range(rows):
+        row = first + r * step
         for start in range(1, inner, _SPAN):
             n = min(_SPAN, inner - start)
             _project(row, start, n, reference, intrinsics, pose, work)

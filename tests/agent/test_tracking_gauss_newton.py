@@ -191,9 +191,17 @@ def test_rotation_prealignment_finds_a_fast_turn(degrees):
     turn = se3.exp([0.0, 0.0, 0.0, 0.3 * np.radians(degrees), np.radians(degrees), 0.0])
     first, second = room_frame(start, 0), room_frame(start @ turn, 1)
     fit = align_rotation(pyramid(first), pyramid(second), previous_from_current=np.eye(4))
+    assert fit is not None
     left = float(np.degrees(se3.rotation_angle(se3.inverse(turn) @ fit.previous_from_current)))
     assert left < 0.3 * degrees
     assert fit.cost_after < fit.cost_before
+
+
+def test_rotation_prealignment_leaves_a_fitting_prediction_alone():
+    poses = walk(2)
+    first, second = (room_frame(pose, i) for i, pose in enumerate(poses))
+    truth = se3.inverse(poses[0]) @ poses[1]
+    assert align_rotation(pyramid(first), pyramid(second), previous_from_current=truth) is None
 
 
 def test_pyramid_cameras_keep_the_rays():
