@@ -87,7 +87,7 @@ class EdgeArrays:
         added = np.repeat(np.stack([sigma_m, sigma_rad], axis=1) ** 2, 3, axis=1)
         covariance = safe_inverse(self.information)
         covariance[:, range(6), range(6)] += added
-        information = np.linalg.inv(covariance)
+        information = np.linalg.inv(covariance).astype(np.float64)
         return EdgeArrays(self.source, self.target, self.source_from_target, information)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from magic_server.posegraph import stacked
 from magic_server.posegraph.arrays import EdgeArrays
@@ -80,9 +80,10 @@ def _neighbours(loops: EdgeArrays, chains: Chains) -> tuple[NDArray[np.int64], N
     # Chains lie so far apart that loops of other pairs of chains are never neighbours.
     place = chains.step + chains.chain * (len(chains.chain) + 2 * NEIGHBOUR_STEPS)
     ends = np.stack([place[loops.source], place[loops.target]], axis=1)
-    distance, other = cKDTree(ends).query(
+    distance, other = KDTree(ends).query(
         ends, k=min(NEIGHBOURS + 1, count), p=np.inf, distance_upper_bound=NEIGHBOUR_STEPS
     )
+    other = np.asarray(other)
     first, column = np.nonzero(np.isfinite(distance) & (other != np.arange(count)[:, None]))
     return first, other[first, column]
 
@@ -104,10 +105,8 @@ class _Cycles:
         missed = self.left[k] @ self.votes_inverse[other] @ self.right[k]
         ends = self.loops.source, self.loops.target
         positions = self.chains.poses[:, :3, 3]
-        distance_m = np.max(
-            [np.linalg.norm(positions[end[k]] - positions[end[other]], axis=1) for end in ends],
-            axis=0,
-        )
+        apart = [np.linalg.norm(positions[end[k]] - positions[end[other]], axis=1) for end in ends]
+        distance_m = np.maximum(apart[0], apart[1])
         drift_m2 = self._drift(self.chains.drift_m2, self.chains.reach_m2, k, other)
         drift_rad2 = self._drift(self.chains.drift_rad2, self.chains.reach_rad2, k, other)
         lever_rad2 = drift_rad2 / 3.0 + self.variance_rad2[other]

@@ -28,21 +28,26 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 STEP = 2.0
-LEAST_MU = 0.004
-"""Annealing starts no wider than loops 16 times beyond their bound: the start is placed already."""
+LEAST_MU = 0.002
+LAST_MU = 0.5
+"""Here loops count up to 3 times beyond their bound; the polish then cuts at the bound."""
+"""Annealing starts no wider than loops 22 times beyond their bound: the start is placed already."""
 MAX_ROUNDS = 30
 ITERATIONS_PER_ROUND = 2
 LEAST_WEIGHT = 1e-3
 POLISH_ROUNDS = 5
+POLISH_ITERATIONS = 4
+FINAL_ITERATIONS = 50
 SEED_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class GncResult:
-    """Poses (n, 4, 4) and which loops (m,) they rest on."""
+    """Poses (n, 4, 4), which loops (m,) they rest on, and where the search began."""
 
     poses: Array
     kept: NDArray[np.bool_]
+    start: Array
 
 
 class RobustGraph:
@@ -57,9 +62,12 @@ class RobustGraph:
         for index in range(len(odometry)):
             self._base.add(odometry_factors.factor(index))
 
-    def solve(self, poses: Array, weights: Array, *, max_iterations: int) -> Array:
+    def solve(
+        self, poses: Array, weights: Array, *, max_iterations: int, tolerance: float = 1e-9
+    ) -> Array:
         """Optimise with the loops' weights (m,); weights below LEAST_WEIGHT are dropped."""
-        return optimise(self._weighted(weights), poses, max_iterations=max_iterations)
+        graph = self._weighted(weights)
+        return optimise(graph, poses, max_iterations=max_iterations, tolerance=tolerance)
 
     def _weighted(self, weights: Array) -> gtsam.NonlinearFactorGraph:
         graph = self._base.clone()
@@ -91,6 +99,7 @@ def graduated(
     polish may take up the others.
     """
     allowed = np.ones(len(graph.loops), bool) if candidates is None else candidates
+    start = poses
     if seed is not None:
         poses = graph.solve(poses, seed.astype(float), max_iterations=SEED_ITERATIONS)
     squared = graph.loops.squared_norms(poses)
@@ -101,25 +110,28 @@ def graduated(
             weights = np.where(allowed, _weights(squared, mu, limit), 0.0)
             poses = graph.solve(poses, weights, max_iterations=ITERATIONS_PER_ROUND)
             squared = graph.loops.squared_norms(poses)
-            decided = (weights < LEAST_WEIGHT) | (weights > 1.0 - LEAST_WEIGHT)
-            if mu > 1.0 and decided.all():
+            if mu >= LAST_MU:
                 break
             mu *= STEP
-    return polished(graph, poses, limit=limit)
+    return polished(graph, poses, limit=limit, start=start)
 
 
 def polished(
-    graph: RobustGraph, poses: Array, *, limit: float, max_iterations: int = 20
+    graph: RobustGraph, poses: Array, *, limit: float, start: Array | None = None
 ) -> GncResult:
     """Alternate between keeping what fits and solving with it, until nothing changes."""
+    start = poses if start is None else start
     kept = graph.loops.squared_norms(poses) < limit
     for _ in range(POLISH_ROUNDS):
-        poses = graph.solve(poses, kept.astype(float), max_iterations=max_iterations)
+        poses = graph.solve(
+            poses, kept.astype(float), max_iterations=POLISH_ITERATIONS, tolerance=1e-5
+        )
         fits = graph.loops.squared_norms(poses) < limit
         if (fits == kept).all():
             break
         kept = fits
-    return GncResult(poses=poses, kept=kept)
+    poses = graph.solve(poses, kept.astype(float), max_iterations=FINAL_ITERATIONS)
+    return GncResult(poses=poses, kept=kept, start=start)
 
 
 def _weights(squared: Array, mu: float, limit: float) -> Array:

@@ -49,11 +49,13 @@ class FactorCache:
         )
 
 
-def optimise(graph: gtsam.NonlinearFactorGraph, poses: Array, *, max_iterations: int) -> Array:
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, poses: Array, *, max_iterations: int, tolerance: float = 1e-9
+) -> Array:
     """Levenberg-Marquardt from poses (n, 4, 4); the result's error is never above the start's."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
-    parameters.setRelativeErrorTol(1e-9)
+    parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(1e-9)
     start = values_of(poses)
     try:

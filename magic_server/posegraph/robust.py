@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from magic_server.posegraph.arrays import connected_sets
 from magic_server.posegraph.chains import Chains, shortened
 from magic_server.posegraph.consistency import LocalSupport, local_support
-from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated
+from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated, polished
 from magic_server.posegraph.placement import known_frames, place
 from magic_server.posegraph.problem import PoseGraphConfig
 
@@ -31,6 +32,8 @@ MIN_TRUSTED_SHARE = 0.25
 """Below this, loops are too sparse to speak for each other, and all of them take part."""
 SEED_SHARE = 0.25
 """Clusters of this size, relative to the largest, are solved with first."""
+CONTINUED_SHARE = 0.7
+"""An earlier solution that explains fewer loops than this is no start."""
 MAX_SCALE = 8.0
 NEAR_MISS_SHARE = 0.1
 REJECTION_NATS = 25.0
@@ -52,8 +55,14 @@ class RobustSolver:
         self._limit = float(chi2.ppf(config.inlier_probability, 6))
         self._chains = chains
 
-    def solve(self) -> GncResult:
-        """GNC, again with wider bounds while that explains the loops better."""
+    def solve(self, initial: Array | None = None) -> GncResult:
+        """GNC, again with wider bounds while that explains the loops better.
+
+        Where an earlier solution `initial` (n, 4, 4) explains everything, it is only polished.
+        """
+        warm = None if initial is None else self._continued(initial)
+        if warm is not None:
+            return warm
         scale = 1.0
         best = self._at_scale(scale)
         cost = self._description_cost(best, scale)
@@ -65,6 +74,24 @@ class RobustSolver:
                 break
             best, cost = wider, wider_cost
         return best
+
+    def _continued(self, initial: Array) -> GncResult | None:
+        """The earlier solution with what is new, if that leaves no doubt; None if it does.
+
+        Doubt is: a rejected loop that others support, or that alone would join what is apart.
+        """
+        graph = self._graph
+        fits = graph.loops.squared_norms(initial) < self._limit
+        if fits.mean() < CONTINUED_SHARE:
+            return None
+        result = polished(graph, initial, limit=self._limit)
+        if result.kept.all():
+            return result
+        support = local_support(graph.loops, self._chains)
+        if (_trusted(support) & ~result.kept).any():
+            return None
+        sets = connected_sets(len(initial), graph.odometry, graph.loops.select(result.kept))
+        return result if (sets == sets[0]).all() else None
 
     def _at_scale(self, scale: float) -> GncResult:
         graph, limit = self._graph, self._limit * scale**2
@@ -82,7 +109,9 @@ class RobustSolver:
 
     def _placed(self, chains: Chains, trusted: Mask, *, scale: float = 1.0) -> Array:
         known = known_frames(chains, self._priors)
-        return place(chains, self._graph.loops, known, weights=1.0 * trusted, scale=scale)
+        return place(
+            chains, self._graph.loops, known, weights=trusted.astype(np.float64), scale=scale
+        )
 
     def _straightened(self, support: LocalSupport, trusted: Mask, limit: float) -> Chains:
         """The chains, each solved with its own trusted loops."""

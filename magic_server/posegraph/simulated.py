@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from magic_core.geometry import se3
 from magic_server.posegraph.problem import Edge, PoseGraphProblem
@@ -122,7 +122,7 @@ def _near_pairs(
 ) -> list[tuple[int, int]]:
     """Pairs within 3 m: half between agents, half within one and far apart in time."""
     positions = np.array([pose[:3, 3] for pose in truth])
-    pairs = cKDTree(positions).query_pairs(3.0, output_type="ndarray")
+    pairs = KDTree(positions).query_pairs(3.0, output_type="ndarray")
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     same = pairs[:, 0] // submaps == pairs[:, 1] // submaps
     inside = pairs[same & (np.abs(pairs[:, 0] - pairs[:, 1]) > 20)]

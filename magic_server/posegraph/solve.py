@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,24 +30,20 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
     odometry = EdgeArrays.of(problem.odometry, number).with_odometry_floor(config)
     loops = EdgeArrays.of(problem.loops, number)
     priors = {number[name]: pose for name, pose in problem.priors.items()}
+    initial = _initial(problem, odometry, count)
     poses = np.tile(np.eye(4), (count, 1, 1))
-    kept = np.zeros(len(loops), dtype=bool)
     start = poses.copy()
+    kept = np.zeros(len(loops), dtype=bool)
     for members, component_priors in _components(count, odometry, loops, priors):
-        new_number = np.full(count, -1, dtype=np.int64)
-        new_number[members] = np.arange(len(members))
-        inside = np.flatnonzero(new_number[loops.source] >= 0)
-        part_odometry = odometry.select(new_number[odometry.source] >= 0).renumbered(new_number)
-        part_loops = loops.select(inside).renumbered(new_number)
-        part_priors = {int(new_number[v]): pose for v, pose in component_priors.items()}
-        chains = follow(len(members), part_odometry)
-        start[members] = place(chains, part_loops, known_frames(chains, part_priors))
-        result = _solve_part(part_odometry, part_loops, chains, part_priors, start[members], config)
-        poses[members] = result.poses
-        kept[inside] = result.kept
+        part = _part(members, odometry, loops, component_priors, initial)
+        result = solve_part(part, config)
+        poses[members], start[members] = result.poses, result.start
+        kept[part.loop_index] = result.kept
+    if problem.initial is not None and all(name in problem.initial for name in number):
+        start = np.array([problem.initial[name] for name in number])
     used = loops.select(kept)
     component = connected_sets(count, odometry, used, _joined_by_priors(priors))
-    poses, start = _own_gauge(poses, component, priors), _own_gauge(start, component, priors)
+    poses = _own_gauge(poses, component, priors)
     before, after = (
         0.5 * float(odometry.squared_norms(at).sum() + used.squared_norms(at).sum())
         for at in (start, poses)
@@ -60,24 +57,74 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
     )
 
 
-def _solve_part(
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A set of vertices that edges join, numbered from 0, the oldest first."""
+
+    odometry: EdgeArrays
+    loops: EdgeArrays
+    loop_index: NDArray[np.int64]  # (m,) number of each loop in the whole problem
+    chains: Chains
+    priors: dict[int, Array]
+    initial: Array | None
+    """(n, 4, 4) an earlier solution to start from, extended by odometry."""
+
+
+def solve_part(part: Part, config: PoseGraphConfig) -> GncResult:
+    """Poses of one connected set of vertices."""
+    known = known_frames(part.chains, part.priors)
+    if not len(part.loops):
+        start = place(part.chains, part.loops, known)
+        return GncResult(start, np.zeros(0, dtype=bool), start)
+    anchors = part.priors or {0: np.eye(4)}
+    graph = RobustGraph(part.odometry, part.loops, anchors)
+    if config.robust == "gnc":
+        return RobustSolver(graph, part.chains, part.priors, config).solve(part.initial)
+    weights = np.ones(len(part.loops))
+    start = place(part.chains, part.loops, known)
+    poses = graph.solve(
+        graph.best_start(start, weights), weights, max_iterations=config.max_iterations
+    )
+    return GncResult(poses, weights > 0, start)
+
+
+def _part(
+    members: NDArray[np.int64],
     odometry: EdgeArrays,
     loops: EdgeArrays,
-    chains: Chains,
     priors: Mapping[int, Array],
-    start: Array,
-    config: PoseGraphConfig,
-) -> GncResult:
-    """Poses of one connected set of vertices, numbered from 0."""
-    if not len(loops):
-        return GncResult(start, np.zeros(0, dtype=bool))
-    graph = RobustGraph(odometry, loops, priors or {0: start[0]})
-    if config.robust == "gnc":
-        return RobustSolver(graph, chains, priors, config).solve()
-    weights = np.ones(len(loops))
-    start = graph.best_start(start, weights)
-    poses = graph.solve(start, weights, max_iterations=config.max_iterations)
-    return GncResult(poses, weights > 0)
+    initial: Array | None,
+) -> Part:
+    count = int(max(members.max(), odometry.source.max(initial=0), odometry.target.max(initial=0),
+                    loops.source.max(initial=0), loops.target.max(initial=0))) + 1  # fmt: skip
+    new_number = np.full(count, -1, dtype=np.int64)
+    new_number[members] = np.arange(len(members))
+    inside = np.flatnonzero(new_number[loops.source] >= 0)
+    own_odometry = odometry.select(new_number[odometry.source] >= 0).renumbered(new_number)
+    own_initial = None if initial is None else initial[members]
+    return Part(
+        odometry=own_odometry,
+        loops=loops.select(inside).renumbered(new_number),
+        loop_index=inside,
+        chains=follow(len(members), own_odometry),
+        priors={int(new_number[vertex]): pose for vertex, pose in priors.items()},
+        initial=None if own_initial is None or np.isnan(own_initial).any() else own_initial,
+    )
+
+
+def _initial(problem: PoseGraphProblem, odometry: EdgeArrays, count: int) -> Array | None:
+    """Poses (n, 4, 4) of the earlier solution; new vertices follow by odometry, NaN if unknown."""
+    if not problem.initial:
+        return None
+    poses = np.full((count, 4, 4), np.nan)
+    for index, name in enumerate(problem.vertices):
+        if name in problem.initial:
+            poses[index] = problem.initial[name]
+    for edge in np.argsort(odometry.target, kind="stable").tolist():
+        source, target = int(odometry.source[edge]), int(odometry.target[edge])
+        if np.isnan(poses[target]).any():
+            poses[target] = poses[source] @ odometry.source_from_target[edge]
+    return poses
 
 
 def _components(

@@ -53,13 +53,13 @@ class RegistrationConfig:
     """Least inliers of the coarse method (its own count)."""
     min_overlap: float = 0.15
     """Least share of either view's readings that the other one confirms."""
-    min_fitness: float = 0.5
+    min_fitness: float = 0.45
     """Least share of the readings that fall on readings of the other view and agree in depth."""
     max_rmse_m: float = 0.04
     """Largest point-to-plane root mean square of agreeing readings."""
-    min_texture_correlation: float = 0.45
+    min_texture_correlation: float = 0.5
     """Least correlation of contrast-normalised intensity where both views agree in depth."""
-    max_free_space: float = 0.08
+    max_free_space: float = 0.06
     """Largest share of readings that stand in space which the other view saw through."""
     min_information: float = 100.0
     """Least eigenvalue of the information, 1/m^2 and 1/rad^2 (100: 10 cm, 0.1 rad)."""

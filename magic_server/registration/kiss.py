@@ -12,7 +12,8 @@ from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.view import PreparedView
 
 VOXEL_SIZES_M = (0.08, 0.05)
-"""Feature sizes that are tried, each giving one hypothesis; the larger is faster, the smaller\nfinds a few more."""
+"""Feature sizes that are tried, each giving one hypothesis; the larger is faster, the
+smaller finds a few more."""
 LEAST_POINTS = 100
 
 

@@ -1,4 +1,4 @@
-"""Kernels of projective association: points of one image against another one's depth and texture."""
+"""Kernels of projective association: points of one image against another's depth and texture."""
 
 from __future__ import annotations
 
