@@ -118,6 +118,20 @@ class SessionCoordinator:
             return False
         return True
 
+    async def placed(self, agent: str, *, timeout_s: float) -> bool:
+        """Wait until the newest solution holds every sub-map that an agent has stored by now.
+
+        `agent` is its resource name. False when that took too long.
+        """
+        wanted = self.graph.names_of(agent)
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not wanted <= {pose.submap for pose in self.board.of_agent(agent).poses}:
+                    await self.board.newer_than(self.board.revision)
+        except TimeoutError:
+            return False
+        return True
+
     async def nearest(
         self, vector: np.ndarray, *, count: int, min_similarity: float
     ) -> list[records.LoopCandidate]:

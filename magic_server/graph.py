@@ -27,6 +27,10 @@ class SessionGraph:
         """Accepted loops."""
         return sum(loop.verdict == "ACCEPTED" for loop in self._loops.values())
 
+    def names_of(self, agent: str) -> set[str]:
+        """The sub-maps of an agent, all by resource name."""
+        return {vertex.name for vertex in self._vertices.values() if vertex.agent == agent}
+
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
         self._vertices[vertex.name] = vertex

@@ -179,9 +179,16 @@ class MappingCalls(Connection):
             finally:
                 call.cancel()
 
-    async def get_trajectory(self, session: str, agent: str) -> tuple[records.TrajectoryPart, ...]:
-        """The corrected camera pose of every frame of an agent, one part per sub-map."""
-        request = mapping_pb.GetTrajectoryRequest(agent=names.agent_name(session, agent))
+    async def get_trajectory(
+        self, session: str, agent: str, *, wait_s: float = 30.0
+    ) -> tuple[records.TrajectoryPart, ...]:
+        """The corrected camera pose of every frame of an agent, one part per sub-map.
+
+        Waits up to `wait_s` (at most 60) for a solution that holds all the agent has stored.
+        """
+        request = mapping_pb.GetTrajectoryRequest(
+            agent=names.agent_name(session, agent), wait_s=wait_s
+        )
 
         async def attempt() -> list[mapping_pb.GetTrajectoryResponse]:
             call = self.mapping_stub.GetTrajectory(request, timeout=self.config.download_timeout_s)

@@ -25,6 +25,7 @@ from magic_server.sessions import Sessions
 from magic_server.store import Store, require_model
 
 Context = grpc.aio.ServicerContext
+MAX_WAIT_S = 60.0
 
 
 class MappingServicer(mapping_grpc.MappingServiceServicer):
@@ -146,8 +147,11 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         self, request: mapping_pb.GetTrajectoryRequest, context: Context
     ) -> AsyncIterator[mapping_pb.GetTrajectoryResponse]:
         session, agent = names.parse_agent(request.agent, field="agent")
+        if not 0.0 <= request.wait_s <= MAX_WAIT_S:
+            raise InvalidInput.field("wait_s", f"expected 0 to {MAX_WAIT_S:g} seconds")
         row = await self._store.agents.agent(session, agent)
         coordinator = await self._sessions.coordinator(row.session)
+        await coordinator.placed(request.agent, timeout_s=request.wait_s)
         snapshot = coordinator.board.of_agent(request.agent)
         loop = asyncio.get_running_loop()
         for pose in snapshot.poses:

@@ -291,6 +291,8 @@ async def test_a_server_started_again_knows_everything(mapped, config: ServerCon
         await client.register_agent("room", "agent_2", model_id=MODEL_ID, dimension=DIMENSION)
         late = make_submap(agent=2, index=0, camera=LARGE, frames=4, keyframes=2, submaps=SUBMAPS)
         await client.submit_submap(late)
+        (part,) = await client.get_trajectory("room", "agent_2", wait_s=60.0)
+        assert (part.submap, len(part.frames)) == (late.name, len(late.trajectory))
         assert await coordinator.idle(timeout_s=100)
         final = await client.get_corrected_poses("room")
         assert final.revision > before.revision
