@@ -14,7 +14,7 @@ from magic_core.geometry.alignment import align_points
 def test_recovers_the_motion_between_two_copies(seed):
     rng = np.random.default_rng(seed)
     truth = se3.exp(rng.normal(size=6) * (3, 3, 3, 1.5, 1.5, 1.5))
-    source = rng.normal(size=(30, 3)) + (100, -50, 20)
+    source = rng.normal(size=(30, 3)) + np.array([100, -50, 20])
     found = align_points(source, se3.transform_points(truth, source))
     np.testing.assert_allclose(found, truth, atol=1e-9)
 

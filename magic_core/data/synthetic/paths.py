@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from magic_core.geometry import se3
-
 Array = NDArray[np.float64]
 
 STEP_M = 0.030
@@ -57,12 +55,12 @@ def _closed_walk(rng: np.random.Generator) -> Array:
     values[:, :3] = CubicSpline(distance, knots[:, :3], bc_type="periodic")(fine)
     values[:, 3:] = PchipInterpolator(distance, knots[:, 3:])(fine)
     values += _sway(fine / distance[-1], rng)
-    poses = np.array([_looking(row) for row in values])
+    poses = _looking(values)
     cost = np.concatenate([[0.0], np.cumsum(_frame_cost(poses))])
     count = int(cost[-1])
     nearest = np.linspace(0, cost[-1], count, endpoint=False)
     resampled = np.stack([np.interp(nearest, cost, column) for column in values.T], axis=1)
-    return np.array([_looking(row) for row in resampled])
+    return _looking(resampled)
 
 
 def _sway(share: Array, rng: np.random.Generator) -> Array:
@@ -75,13 +73,18 @@ def _sway(share: Array, rng: np.random.Generator) -> Array:
     return total
 
 
-def _looking(row: Array) -> Array:
-    """The camera pose at (x, y, z) that looks along yaw and pitch, without roll."""
-    yaw, pitch = np.deg2rad(row[3:5])
-    forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    down = np.cross(forward, right)
-    return se3.from_rotation_translation(np.stack([right, down, forward], axis=1), row[:3])
+def _looking(rows: Array) -> Array:
+    """(n, 4, 4) camera poses at (x, y, z) that look along yaw and pitch (n, 5), without roll."""
+    yaw, pitch = np.deg2rad(rows[:, 3:5].T)
+    level = np.zeros_like(yaw)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 0] = np.stack([np.sin(yaw), -np.cos(yaw), level], axis=1)
+    poses[:, :3, 2] = np.stack(
+        [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=1
+    )
+    poses[:, :3, 1] = np.cross(poses[:, :3, 2], poses[:, :3, 0])
+    poses[:, :3, 3] = rows[:, :3]
+    return poses
 
 
 def _frame_cost(poses: Array) -> Array:

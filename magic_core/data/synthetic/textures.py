@@ -47,11 +47,12 @@ def noise(
             break
         grid = rng.standard_normal((rows, columns)).astype(np.float32)
         wrapped = np.pad(grid, 2, mode="wrap")
-        step_y, step_x = height / rows, width / columns
-        y = (np.arange(height, dtype=np.float32) + 0.5) / step_y + 1.5
-        x = (np.arange(width, dtype=np.float32) + 0.5) / step_x + 1.5
-        map_x, map_y = np.meshgrid(x, y)
-        total += weight * cv2.remap(wrapped, map_x, map_y, cv2.INTER_CUBIC)
+        step_y, step_x = rows / height, columns / width
+        grid_from_image = np.array(
+            [[step_x, 0.0, 0.5 * step_x + 1.5], [0.0, step_y, 0.5 * step_y + 1.5]]
+        )
+        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        total += weight * cv2.warpAffine(wrapped, grid_from_image, (width, height), flags=flags)
         norm += weight**2
         weight *= gain
     return total / np.float32(np.sqrt(norm))
