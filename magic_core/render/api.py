@@ -90,8 +90,9 @@ def render(
     if backend == "cpu":
         image, visible, radii = _render_cpu(parameters, camera, pose, threads)
     elif backend == "cuda":
-        image, visible, radii = render_cuda(parameters, camera, pose)
+        image, visible, radii = render_cuda(parameters, camera, pose.float())
     elif backend == "reference":
+        pose = pose.to(gaussians.means.dtype)
         image, visible, radii = render_reference(parameters, camera, pose)
     else:
         rule = "expected auto, cpu, cuda or reference"
@@ -100,16 +101,14 @@ def render(
 
 
 def _pose(world_from_camera: Tensor | ArrayLike, tangent: Tensor | None, *, like: Tensor) -> Tensor:
-    """world_from_camera @ exp(tangent) in the Gaussians' dtype, float64 for the cpu backend."""
-    precision = torch.float64 if not like.is_cuda else like.dtype
+    """world_from_camera @ exp(tangent), float64, on the Gaussians' device."""
     if isinstance(world_from_camera, Tensor):
-        pose = world_from_camera.to(like.device, precision)
+        pose = world_from_camera.to(like.device, torch.float64)
     else:
-        array = np.asarray(world_from_camera, dtype=np.float64)
-        pose = torch.tensor(array, dtype=precision, device=like.device)
-    if tangent is not None:
-        pose = pose @ se3_exp(tangent.to(like.device, precision))
-    return pose if like.dtype == torch.float32 and not like.is_cuda else pose.to(like.dtype)
+        pose = torch.tensor(np.asarray(world_from_camera, dtype=np.float64), device=like.device)
+    if tangent is None:
+        return pose
+    return pose @ se3_exp(tangent.to(like.device, torch.float64))
 
 
 def se3_exp(tangent: Tensor) -> Tensor:

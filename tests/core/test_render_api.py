@@ -87,6 +87,19 @@ def test_a_dense_scene_agrees_with_the_reference():
         assert relative(a, b) < 1e-3, name
 
 
+def test_a_flat_wall_of_equal_depths_blends_in_the_reference_s_order():
+    camera = Camera(40, 30, 36.0, 36.0, 19.5, 14.5)
+    cloud = cloud_before(camera, 600, 11)
+    cloud.means[:, :2] *= 2.0 / cloud.means[:, 2:]
+    cloud.means[:, 2] = 2.0
+    upstream = np.random.default_rng(0).normal(size=(5, 30, 40))
+    found, gradients, _ = gradients_of("cpu", cloud, camera, np.eye(4), upstream)
+    expected, reference, _ = gradients_of("reference", cloud, camera, np.eye(4), upstream)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    for name, a, b in zip((*NAMES, "pose"), gradients, reference, strict=True):
+        assert relative(a, b) < 1e-3, name
+
+
 def test_the_reference_passes_gradcheck():
     camera = Camera(6, 5, 7.0, 7.0, 2.5, 2.0)
     cloud = cloud_before(camera, 6, 3, smallest=-2.5)
@@ -166,6 +179,8 @@ def test_auto_takes_the_cpu_for_cpu_tensors_and_clouds():
     cloud = cloud_before(camera, 30, 2)
     auto, cpu = render(cloud, camera, np.eye(4)), render(cloud, camera, np.eye(4), "cpu")
     assert torch.equal(auto.colour, cpu.colour)
+    reference = render(cloud, camera, np.eye(4), "reference")  # float32 like its input
+    np.testing.assert_allclose(auto.colour, reference.colour, atol=1e-4)
     assert auto.radii[auto.visible].min() > 0
 
 

@@ -161,3 +161,15 @@ def test_buffers_can_be_used_for_other_sizes_and_clouds():
 def test_gradients_need_a_render_first():
     with pytest.raises(WrongState):
         Rasteriser(1).backward(np.zeros((5, 37, 53), np.float32))
+
+
+def test_a_million_gaussians_render_and_differentiate():
+    cloud = random_cloud(1_000_000, seed=6, near=0.5, far=20.0)
+    rasteriser = Rasteriser()
+    view = rasteriser.render(cloud, CAMERA, np.eye(4))
+    gradients = rasteriser.backward(np.ones_like(view.image))
+    assert view.alpha.min() > 0.9
+    assert np.isfinite(view.image).all()
+    for array in (gradients.means, gradients.quaternions, gradients.scales, gradients.opacities):
+        assert np.isfinite(array).all()
+    assert gradients.means[~view.visible].any() == np.False_
