@@ -10,7 +10,7 @@ from magic_core.data import Frame
 from magic_core.geometry import Camera, se3
 
 CAMERA = Camera(width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
-HALF_SIZE = np.array([2.0, 1.4, 2.5])  # metres; the camera is near the centre
+HALF_SIZE = np.array([1.1, 0.9, 2.0])  # metres; the camera is near the centre
 _WAVES = np.random.default_rng(7).normal(0.0, 3.0, (3, 3))
 _PHASES = np.random.default_rng(8).uniform(0.0, 6.28, 3)
 _TILE_COLOURS = np.random.default_rng(9).uniform(0.0, 1.0, (4096, 3))
