@@ -104,7 +104,7 @@ def seed_uniform(
     Scales are the distance to the nearest neighbour among the seeds and the `existing` means
     (m, 3), camera frame (paper, supplement, "Mapping").
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     pixels = np.flatnonzero(need & (depth > 0))
     if len(pixels) > count:
@@ -112,7 +112,7 @@ def seed_uniform(
     means = camera.back_project(depth).reshape(-1, 3)[pixels]
     if len(means) == 0:
         return GaussianCloud.empty()
-    tree = cKDTree(np.concatenate([means, existing.reshape(-1, 3)]))
+    tree = KDTree(np.concatenate([means, existing.reshape(-1, 3)]))
     nearest = tree.query(means, k=2)[0][:, 1] if tree.n > 1 else np.full(len(means), 0.01)
     quaternions = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(means), 1))
     return GaussianCloud.from_arrays(
@@ -176,7 +176,7 @@ def _pooled(stack: Image) -> Image:
     """Sums over 2x2 blocks of an (h, w, c) image; an odd last row or column is left out."""
     h, w = stack.shape[0] // 2 * 2, stack.shape[1] // 2 * 2
     rows = stack[0:h:2, :w] + stack[1:h:2, :w]
-    return rows[:, 0::2] + rows[:, 1::2]
+    return np.asarray(rows[:, 0::2] + rows[:, 1::2], np.float32)
 
 
 def _all_four(mask: Mask) -> Mask:
@@ -207,7 +207,8 @@ def _leaves(levels: list[tuple[int, Image, Mask]], smallest: int) -> _Blocks:
             keep = (rows % (smallest // side) == 0) & (columns % (smallest // side) == 0)
             rows, columns = rows[keep], columns[keep]
         mean = stack[rows, columns] / float(side * side)
-        centres = np.stack([columns, rows], axis=-1) * side + 0.5 * (side - 1)
+        corners = np.stack([columns, rows], axis=-1).astype(np.float64)
+        centres = np.asarray(corners * side + 0.5 * (side - 1), np.float64)
         sides = np.full(len(rows), float(max(side, smallest)))
         found.append(_Blocks(centres, sides, mean[:, :3], mean[:, 7], mean[:, 4:7]))
     return _Blocks(
@@ -252,12 +253,11 @@ def _surface_axes(
     along = (rays * normals).sum(axis=-1, keepdims=True)
     slant = rays - along * normals
     # A ray along the normal leaves no slant direction: any tangent will do.
-    fallback = np.cross(
-        normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    )
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    fallback = np.asarray(np.cross(normals, helper), np.float64)
     slant = np.where(np.linalg.norm(slant, axis=-1, keepdims=True) > 1e-4, slant, fallback)
     slant /= np.linalg.norm(slant, axis=-1, keepdims=True)
-    across = np.cross(normals, slant)
+    across = np.asarray(np.cross(normals, slant), np.float64)
     return np.stack([slant, across, normals], axis=-1), np.abs(along[:, 0])
 
 

@@ -73,8 +73,8 @@ def _normals(
     # the smooth value stays, so that the rim of a hole is not taken for a cliff.
     uneven = (inverse > 0) & (np.abs(smooth - inverse) > 0.03 * inverse)
     smooth = np.where(uneven, inverse, smooth)
-    nx = _rim_from_inside(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)) * camera.fx
-    ny = _rim_from_inside(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)) * camera.fy
+    nx = _rim_from_inside(_gradient(smooth, 1, 0)) * camera.fx
+    ny = _rim_from_inside(_gradient(smooth, 0, 1)) * camera.fy
     rays = camera.rays()
     nz = inverse - nx * rays[..., 0] - ny * rays[..., 1]
     normals = -np.stack([nx, ny, nz], axis=-1)
@@ -83,6 +83,12 @@ def _normals(
     return np.where(usable[..., None], normals / np.maximum(length, 1e-9)[..., None], 0.0).astype(
         np.float32
     )
+
+
+def _gradient(image: NDArray[np.float32], along_x: int, along_y: int) -> NDArray[np.float32]:
+    """Smoothed central difference per pixel (Sobel)."""
+    filtered = cv2.Sobel(image, cv2.CV_32F, along_x, along_y, ksize=3, scale=0.125)
+    return np.asarray(filtered, np.float32)
 
 
 def _rim_from_inside(image: NDArray[np.float32], rim: int = 3) -> NDArray[np.float32]:

@@ -14,8 +14,10 @@ class MergeConfig:
     refine: bool = True
     """Run the fine stage; without it the merged map is the sub-maps appended."""
     iterations: int = 3000
-    """Most optimisation steps of the fine stage; it stops earlier once converged."""
-    converged: float = 0.004
+    """Most optimisation steps of the fine stage (the paper's 3,000)."""
+    passes: int = 6
+    """Most visits per keyframe on average; the smaller of both budgets counts."""
+    converged: float = 0.01
     """Converged when a pass over the keyframes lowers the mean loss by less than this share."""
     fill: bool = True
     """Seed Gaussians where the keyframes see surface that the appended sub-maps do not show."""
@@ -36,9 +38,9 @@ class MergeConfig:
     """Weight of the depth loss."""
     regularisation_weight: float = 1.0
     """Weight of the scale regularisation."""
-    means_rate_m: float = 5e-4
+    means_rate_m: float = 1e-3
     """Adam step of the means in metres at the start; all steps shrink to `final_rate`."""
-    final_rate: float = 0.1
+    final_rate: float = 0.3
     """Share of the learning rates that is left when the budget is spent."""
     threads: int = 0
     """Threads of the rasteriser; 0 takes its own default."""
@@ -49,6 +51,8 @@ class MergeConfig:
         """Raise ConfigError naming each value that the merge cannot work with."""
         rules = {
             "iterations": (self.iterations >= 0, "expected 0 or more"),
+            "passes": (self.passes >= 1, "expected at least 1"),
+            "final_rate": (0.0 < self.final_rate <= 1.0, "expected more than 0, at most 1"),
             "converged": (self.converged >= 0.0, "expected 0 or more"),
             "alpha_threshold": (0.0 <= self.alpha_threshold <= 1.0, "expected 0 to 1"),
             "prune_opacity": (0.0 <= self.prune_opacity < 1.0, "expected 0 to 1"),
