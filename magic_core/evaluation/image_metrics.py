@@ -26,7 +26,7 @@ def ssim(rendered: Image, reference: Image) -> float:
     """Structural similarity of (h, w, 3) images, uint8 or float 0 to 1, averaged over channels.
 
     Wang et al., "Image Quality Assessment" (TIP 2004): Gaussian window of 11 pixels and sigma
-    1.5, over the pixels whose whole window lies in the image.
+    1.5, images mirrored at their borders.
     """
     a, b = _both_unit_range(rendered, reference)
     if min(a.shape[:2]) < _WINDOW:
@@ -76,5 +76,4 @@ def _unit_range(image: Image) -> NDArray[np.float64]:
 
 def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
     blurred = cv2.GaussianBlur(np.ascontiguousarray(image), (_WINDOW, _WINDOW), _SIGMA)
-    margin = _WINDOW // 2
-    return np.asarray(blurred, np.float64)[margin:-margin, margin:-margin]
+    return np.asarray(blurred, np.float64)

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _ELEVATION_RAD = np.deg2rad(56.0)
 _FIELD_OF_VIEW_RAD = np.deg2rad(36.0)
 _MARGIN = 1.04
+_OWN_UP_WEIGHT = 0.004  # what a few degrees of roll spread the horizontal axes vertically
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,7 @@ def up_direction(world_from_camera: Array) -> Array:
     """
     across = world_from_camera[:, :3, 0]
     own_up = -world_from_camera[:, :3, 1].mean(axis=0)
-    moment = across.T @ across / len(across) - 0.2 * np.outer(own_up, own_up)
+    moment = across.T @ across / len(across) - _OWN_UP_WEIGHT * np.outer(own_up, own_up)
     up = np.linalg.eigh(moment)[1][:, 0]
     return up if up @ own_up > 0 else -up
 
