@@ -283,6 +283,7 @@ def blend(claimed, tiles, tiles_x, width, height, records, lists, starts, patter
     """
     scratch = layout_scratch(_SCRATCH)
     hit_words = np.zeros(BLOCKS, np.uint64)
+    hit_masks = np.zeros(BATCH, np.uint32)
     while True:
         tile = claim(claimed, np.int64(1))
         if tile >= tiles:
@@ -311,7 +312,11 @@ def blend(claimed, tiles, tiles_x, width, height, records, lists, starts, patter
                             alive &= ~(np.uint32(1) << np.uint32(block))
                 write(hit_words, block, hits)
             for part in range(0, kept - first, LANES):
-                store_columns(masks, first + part, hit_words, part)
+                store_columns(hit_masks, part, hit_words, part)
+            # One by one: a whole vector would reach into the next tile's masks, which another
+            # thread may have written already.
+            for i in range(kept - first):
+                write(masks, first + i, read(hit_masks, i))
             while reached != np.uint64(0):
                 g = np.int64(read(lists, first + trailing_zeros(reached)))
                 write(visible, g, np.uint8(1))
