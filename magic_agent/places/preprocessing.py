@@ -74,9 +74,9 @@ class Preprocessing:
             output = output.mean(axis=1)
         elif output.ndim == 3 and self.pooling == "first":
             output = output[:, 0]
-        vector = output.reshape(-1)
+        vector = np.asarray(output.reshape(-1), dtype=np.float32)
         norm = float(np.linalg.norm(vector))
-        return vector / np.float32(norm) if norm > 0 else vector
+        return (vector / norm).astype(np.float32) if norm > 0 else vector
 
 
 def read_sidecar(model_path: Path) -> Preprocessing | None:

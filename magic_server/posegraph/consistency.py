@@ -127,6 +127,35 @@ class _Cycles:
         return total
 
 
+def odometry_miss(loops: EdgeArrays, chains: Chains) -> tuple[Array, Array]:
+    """How far each loop contradicts its chain's odometry, and how far that may be off, metres.
+
+    (m,) each: the distance of the loop's target where odometry and where the loop puts it, and
+    odometry's standard deviation of it. 0 and infinity where the loop joins two chains.
+    """
+    source, target = loops.source, loops.target
+    predicted = stacked.inverse(chains.poses[source]) @ chains.poses[target]
+    miss_m = np.linalg.norm(predicted[:, :3, 3] - loops.source_from_target[:, :3, 3], axis=1)
+    drift_m2 = np.abs(chains.drift_m2[source] - chains.drift_m2[target])
+    drift_rad2 = np.abs(chains.drift_rad2[source] - chains.drift_rad2[target])
+    lever_m = np.linalg.norm(predicted[:, :3, 3], axis=1)
+    loop_m2, _ = loops.variances()
+    # Each axis on its own: three axes make a distance. Drift bends the way: a lever of the
+    # distance alone would call a full circle certain, so the steps' own extent counts too.
+    extent_m = np.maximum(lever_m, _extent(loops, chains))
+    sigma_m = np.sqrt(3.0 * (drift_m2 + loop_m2 + drift_rad2 / 3.0 * extent_m**2))
+    same = chains.chain[source] == chains.chain[target]
+    return np.where(same, miss_m, 0.0), np.where(same, sigma_m, np.inf)
+
+
+def _extent(loops: EdgeArrays, chains: Chains) -> Array:
+    """How far each chain reaches from its start, metres, for the loops' chains."""
+    reach = np.linalg.norm(chains.poses[:, :3, 3], axis=1)
+    farthest = np.zeros(len(reach))
+    np.maximum.at(farthest, chains.chain, reach)
+    return farthest[chains.chain[loops.source]]
+
+
 def oriented_by_age(loops: EdgeArrays, chains: Chains) -> EdgeArrays:
     """The loops with the older chain (within one chain: the older vertex) as source."""
     a, b = chains.chain[loops.source], chains.chain[loops.target]

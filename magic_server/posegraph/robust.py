@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from magic_server.posegraph.arrays import connected_sets
 from magic_server.posegraph.chains import Chains, shortened
-from magic_server.posegraph.consistency import LocalSupport, local_support
+from magic_server.posegraph.consistency import LocalSupport, local_support, odometry_miss
 from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated, polished
 from magic_server.posegraph.placement import known_frames, place
 from magic_server.posegraph.problem import PoseGraphConfig
@@ -32,8 +32,11 @@ MIN_TRUSTED_SHARE = 0.25
 """Below this, loops are too sparse to speak for each other, and all of them take part."""
 SEED_SHARE = 0.25
 """Clusters of this size, relative to the largest, are solved with first."""
+CONTINUED_FROM = 300
+"""Smaller graphs are solved from the start every time: that takes no longer than a blink."""
 CONTINUED_SHARE = 0.7
 """An earlier solution that explains fewer loops than this is no start."""
+DRIFT_SIGMAS = 3.0
 MAX_SCALE = 8.0
 NEAR_MISS_SHARE = 0.1
 REJECTION_NATS = 25.0
@@ -52,6 +55,7 @@ class RobustSolver:
     ) -> None:
         self._graph = graph
         self._priors = priors
+        self._max_unsupported_m = config.max_unsupported_correction_m
         self._limit = float(chi2.ppf(config.inlier_probability, 6))
         self._chains = chains
 
@@ -78,9 +82,12 @@ class RobustSolver:
     def _continued(self, initial: Array) -> GncResult | None:
         """The earlier solution with what is new, if that leaves no doubt; None if it does.
 
-        Doubt is: a rejected loop that others support, or that alone would join what is apart.
+        Doubt is: a rejected loop that others support or cannot speak about, that drift may
+        explain, or that alone would join what is apart.
         """
         graph = self._graph
+        if len(initial) < CONTINUED_FROM:
+            return None
         fits = graph.loops.squared_norms(initial) < self._limit
         if fits.mean() < CONTINUED_SHARE:
             return None
@@ -88,7 +95,8 @@ class RobustSolver:
         if result.kept.all():
             return result
         support = local_support(graph.loops, self._chains)
-        if (_trusted(support) & ~result.kept).any():
+        unheard = (support.asked == 0) | self._is_drift()
+        if ((_trusted(support) | unheard) & ~result.kept).any():
             return None
         sets = connected_sets(len(initial), graph.odometry, graph.loops.select(result.kept))
         return result if (sets == sets[0]).all() else None
@@ -98,7 +106,7 @@ class RobustSolver:
         support = local_support(graph.loops, self._chains, scale=scale)
         trusted = _trusted(support)
         if trusted.sum() < MIN_TRUSTED_SHARE * len(trusted):
-            trusted = np.ones_like(trusted)
+            trusted = ~self._lacks_witness(support, scale)
         if len(self._chains.oldest) == 1:
             seed = trusted & (support.cluster_size >= SEED_SHARE * support.cluster_size.max())
             start = self._placed(self._chains, trusted)
@@ -106,6 +114,17 @@ class RobustSolver:
         chains = self._straightened(support, trusted, limit)
         start = self._placed(chains, trusted, scale=scale)
         return graduated(graph, start, limit=limit, seed=None, candidates=trusted)
+
+    def _lacks_witness(self, support: LocalSupport, scale: float) -> Mask:
+        """Loops that alone would move a map farther than one witness may."""
+        miss_m, sigma_m = odometry_miss(self._graph.loops, self._chains)
+        far = miss_m > self._max_unsupported_m + DRIFT_SIGMAS * scale * sigma_m
+        return far & (support.agreeing == 0)
+
+    def _is_drift(self) -> Mask:
+        """Loops that contradict their chain's odometry by no more than its drift explains."""
+        miss_m, sigma_m = odometry_miss(self._graph.loops, self._chains)
+        return (miss_m < DRIFT_SIGMAS * sigma_m) & np.isfinite(sigma_m)
 
     def _placed(self, chains: Chains, trusted: Mask, *, scale: float = 1.0) -> Array:
         known = known_frames(chains, self._priors)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import open3d as o3d
+import open3d
 
 from magic_server.registration.coarse import Hypothesis
 from magic_server.registration.config import RegistrationConfig
@@ -17,6 +17,8 @@ ITERATIONS = 100_000
 CONFIDENCE = 0.999
 LEAST_POINTS = 50
 
+# Open3D fills its modules in at run time: static checks see nothing in them.
+o3d: Any = open3d
 registration = o3d.pipelines.registration
 
 
@@ -26,10 +28,10 @@ class FpfhRansac:
     def propose(
         self, source: PreparedView, target: PreparedView, config: RegistrationConfig
     ) -> Iterator[Hypothesis]:
+        if min(len(source.points), len(target.points)) < LEAST_POINTS:
+            return
         source_cloud, source_features = _features(source)
         target_cloud, target_features = _features(target)
-        if min(len(source_cloud.points), len(target_cloud.points)) < LEAST_POINTS:
-            return
         o3d.utility.random.seed(config.seed)
         result = registration.registration_ransac_based_on_feature_matching(
             source_cloud,

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
-import kiss_matcher
+import kiss_matcher as _kiss_matcher
 import numpy as np
 
 from magic_server.registration.coarse import Hypothesis
 from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.view import PreparedView
+
+# The package re-exports its extension module at run time.
+kiss_matcher: Any = _kiss_matcher
 
 VOXEL_SIZES_M = (0.08, 0.05)
 """Feature sizes that are tried, each giving one hypothesis; the larger is faster, the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,7 +72,9 @@ def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
     """Pyramids, point cloud and keypoints of a view; worth keeping if it is matched often."""
     images = [(np.eye(4), view.colour, view.depth), *view.keyframes]
     images = images[: 1 + config.max_keyframes]
-    frames = tuple(_frame(view.camera, *image, config) for image in images)
+    frames = tuple(
+        _frame(view.camera, pose, colour, depth, config) for pose, colour, depth in images
+    )
     keypoints = [
         _keypoints(frame, image[1], config) for frame, image in zip(frames, images, strict=True)
     ]
@@ -144,7 +147,7 @@ def _level(camera: Camera, image: Float32, depth: Float32) -> Level:
         normals=normals_of(camera.back_project(_filled(smoothed, depth))),
         texture=np.ascontiguousarray(texture, dtype=np.float32),
         gradient=np.ascontiguousarray(gradient / np.float32(32.0), dtype=np.float32),
-        colour=cv2.GaussianBlur(image, (0, 0), 1.5),
+        colour=np.asarray(cv2.GaussianBlur(image, (0, 0), 1.5), dtype=np.float32),
     )
 
 
@@ -156,9 +159,9 @@ def _filled(smoothed: Float32, depth: Float32) -> Float32:
 def _halved(camera: Camera, image: Float32, depth: Float32) -> tuple[Camera, Float32, Float32]:
     """Half the size; a depth pixel is the mean of its four where they lie on one surface."""
     height, width = depth.shape[0] // 2, depth.shape[1] // 2
-    image = cv2.resize(
-        image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA
-    )
+    whole = image[: 2 * height, : 2 * width]
+    shrunk = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    image = np.asarray(shrunk, dtype=np.float32)
     four = depth[: 2 * height, : 2 * width].reshape(height, 2, width, 2).swapaxes(1, 2)
     four = four.reshape(height, width, 4)
     valid = four > 0
@@ -207,7 +210,8 @@ def _keypoints(
     size = (level.camera.width, level.camera.height)
     if grey.shape[1] != size[0]:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    sift = cv2.SIFT_create(nfeatures=config.max_keypoints, contrastThreshold=0.01)
+    create_sift: Any = getattr(cv2, "SIFT_create")  # noqa: B009 - missing in the type stubs
+    sift = create_sift(nfeatures=config.max_keypoints, contrastThreshold=0.01)
     found, descriptors = sift.detectAndCompute(grey, None)
     if not found or descriptors is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 128), np.float32)

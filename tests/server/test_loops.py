@@ -1,0 +1,65 @@
+"""Loop candidates: thresholds per encoder, neighbours, diversity."""
+
+from __future__ import annotations
+
+import pytest
+
+from magic_core.errors import ConfigError
+from magic_server.loops import LoopConfig, SubmapKey, select_candidates
+
+
+def key(agent: str, index: int) -> SubmapKey:
+    return SubmapKey(agent, index, f"{agent}/{index}")
+
+
+def names(candidates) -> list[str]:
+    return [candidate.hit.name for candidate in candidates]
+
+
+def test_keeps_similar_places_most_similar_first():
+    hits = [(key("b", 1), 0.7), (key("c", 4), 0.9), (key("b", 8), 0.3)]
+    config = LoopConfig(min_similarity=0.5)
+    assert names(select_candidates(key("a", 0), hits, config)) == ["c/4", "b/1"]
+
+
+def test_leaves_out_itself_and_its_neighbours_in_the_same_agent_only():
+    hits = [(key("a", 5), 1.0), (key("a", 4), 0.95), (key("a", 3), 0.9), (key("b", 5), 0.8)]
+    config = LoopConfig(min_similarity=0.5, min_index_gap=2)
+    assert names(select_candidates(key("a", 5), hits, config)) == ["a/3", "b/5"]
+
+
+def test_one_agent_cannot_take_all_places():
+    hits = [(key("b", i), 0.9 - 0.01 * i) for i in range(6)] + [(key("c", 0), 0.6)]
+    config = LoopConfig(min_similarity=0.5, top_k=4, top_k_per_agent=2)
+    assert names(select_candidates(key("a", 0), hits, config)) == ["b/0", "b/1", "c/0"]
+
+
+def test_candidates_of_one_agent_keep_their_distance():
+    hits = [(key("b", i), 0.9 - 0.01 * i) for i in range(6)]
+    config = LoopConfig(min_similarity=0.5, top_k=9, top_k_per_agent=9, min_neighbour_gap=3)
+    assert names(select_candidates(key("a", 0), hits, config)) == ["b/0", "b/3"]
+
+
+def test_pairs_tried_before_are_left_out():
+    hits = [(key("b", 0), 0.9), (key("b", 1), 0.8)]
+    chosen = select_candidates(
+        key("a", 0),
+        hits,
+        LoopConfig(min_similarity=0.5),
+        is_known_pair=lambda query, hit: hit == "b/0",
+    )
+    assert names(chosen) == ["b/1"]
+
+
+def test_threshold_follows_the_encoder():
+    config = LoopConfig()
+    assert config.threshold("dinov2_vits14-0123") == pytest.approx(0.825)  # the paper's 0.35
+    assert config.threshold("efficientnet_lite0-gap1280-v1") < config.threshold("dinov2_x")
+    assert LoopConfig(min_similarity=0.1).threshold("dinov2_x") == 0.1
+
+
+def test_refuses_impossible_settings():
+    with pytest.raises(ConfigError):
+        LoopConfig(top_k=0)
+    with pytest.raises(ConfigError):
+        LoopConfig(min_similarity=1.5)
