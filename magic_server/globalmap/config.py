@@ -15,7 +15,7 @@ class MergeConfig:
     """Run the fine stage; without it the merged map is the sub-maps appended."""
     iterations: int = 3000
     """Most optimisation steps of the fine stage (the paper's 3,000)."""
-    passes: int = 6
+    passes: int = 5
     """Most visits per keyframe on average; the smaller of both budgets counts."""
     converged: float = 0.01
     """Converged when a pass over the keyframes lowers the mean loss by less than this share."""

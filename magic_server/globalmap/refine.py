@@ -22,7 +22,7 @@ from magic_server.globalmap.sampling import VisitOrder, region_weights
 
 Progress = Callable[[float, str], None]
 
-_MIN_STEPS_PER_PASS = 50
+_MIN_STEPS_PER_PASS = 60
 _DEDUPLICATE_AT = 0.5  # share of the budget after which duplicates go, unless the loss settled
 _HIDDEN_SHARE = 0.1  # of min_contribution: what appended sub-maps lose before any optimisation
 
