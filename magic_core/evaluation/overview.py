@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-from matplotlib import colors
+from matplotlib import colors, patheffects
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ from magic_core.geometry import Camera, se3
 _WIDTH, _HEIGHT = 1280, 860
 _GROUND = np.array((18, 21, 27), np.float32)
 _OBSERVERS = 36
+_FRUSTUM_PX = 26  # depth of a drawn camera, as if seen from the side
 _SUPERSAMPLING = 8  # cv2 draws with this many fractional positions per pixel
 
 
@@ -43,11 +44,12 @@ def overview_picture(
     axes = figure.add_subplot(grid[:, 0])
     axes.imshow(outside, interpolation="lanczos", aspect="auto")
     axes.set_axis_off()
+    rim = [patheffects.withStroke(linewidth=4, foreground=_hex(_GROUND))]
     for number, agent in enumerate(agents):
         colour, height = colour_of(number, on_dark=True), 0.965 - 0.042 * number
         axes.text(0.018, height, agent, color=colour, fontsize=15, fontweight="bold",
-                  transform=axes.transAxes, va="top")  # fmt: skip
-    for row, view in enumerate(new_views[:3]):
+                  transform=axes.transAxes, va="top", path_effects=rim)  # fmt: skip
+    for row, view in enumerate(_one_per_agent(new_views)[:3]):
         _new_view(figure.add_subplot(grid[row, 1]), view, agents)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, facecolor=figure.get_facecolor())
@@ -88,8 +90,9 @@ def _draw_track(
     camera_from_world = se3.inverse(world_from_camera)
     rgb = tuple(int(255 * c) for c in colors.to_rgb(colour))
     lines = [trajectory.positions]
+    size_m = _FRUSTUM_PX / camera.fx * _distance(world_from_camera, trajectory)
     for pose in trajectory.world_from_camera[:: max(1, len(trajectory) // 8)]:
-        lines += _frustum(pose)
+        lines += _frustum(pose, size_m=size_m)
     for width, tone in ((6, (12, 14, 18)), (3, rgb)):
         for number, line in enumerate(lines):
             pixels, z = camera.project(se3.transform_points(camera_from_world, line))
@@ -99,13 +102,25 @@ def _draw_track(
                 cv2.polylines(picture, [fixed], False, tone, thick, cv2.LINE_AA, 3)
 
 
-def _frustum(pose: NDArray[np.float64], *, size_m: float = 0.16) -> list[NDArray[np.float64]]:
+def _distance(world_from_camera: NDArray[np.float64], trajectory: Trajectory) -> float:
+    """Metres from a viewer to the middle of a trajectory."""
+    return float(np.linalg.norm(trajectory.positions.mean(axis=0) - world_from_camera[:3, 3]))
+
+
+def _frustum(pose: NDArray[np.float64], *, size_m: float) -> list[NDArray[np.float64]]:
     corners = size_m * np.array(
         [(-0.6, -0.45, 1), (0.6, -0.45, 1), (0.6, 0.45, 1), (-0.6, 0.45, 1)]
     )
     world = se3.transform_points(pose, corners)
     centre = pose[:3, 3]
     return [world[[0, 1, 2, 3, 0]], *(np.stack([centre, corner]) for corner in world)]
+
+
+def _one_per_agent(views: Sequence[ComparedView]) -> list[ComparedView]:
+    """The first view of every agent, then the others."""
+    first = {view.chosen.source.name: view for view in reversed(views)}
+    leading = sorted(first.values(), key=lambda view: view.chosen.source.name)
+    return leading + [view for view in views if view is not first[view.chosen.source.name]]
 
 
 def _new_view(axes, view: ComparedView, agents: Sequence[str]) -> None:

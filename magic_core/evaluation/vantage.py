@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _ELEVATION_RAD = np.deg2rad(56.0)
 _FIELD_OF_VIEW_RAD = np.deg2rad(36.0)
 _MARGIN = 1.04
+_SKETCH_POINTS = 40_000
 _OWN_UP_WEIGHT = 0.004  # what a few degrees of roll spread the horizontal axes vertically
 
 
@@ -120,6 +121,13 @@ class Scene:
     frame: PlanFrame
     positions: Array  # (k, 3) camera centres, which the picture must hold
 
+    def thinned(self, count: int) -> Scene:
+        """The same scene of about `count` Gaussians: enough to see where it ends."""
+        every = slice(None, None, max(1, len(self.cloud) // count))
+        seen = SeenSurface(self.seen.toward_cameras[every], self.seen.normals[every])
+        chosen = np.arange(len(self.cloud))[every]
+        return Scene(self.cloud.select(chosen), seen, self.frame, self.positions)
+
 
 def outside_pose(scene: Scene, camera: Camera, *, azimuth_rad: float) -> Array:
     """(4, 4) pose that looks down at the map from an azimuth, as near as everything fits in."""
@@ -161,9 +169,10 @@ def _bounds(
 def best_outside_pose(scene: Scene, camera: Camera, rasteriser: Renders) -> Array:
     """The outside pose, of twelve round the map, from which most of the picture is filled."""
     small = camera.scaled(160 / camera.width)
+    sketch = scene.thinned(_SKETCH_POINTS)
     poses, scores = [], []
     for azimuth in np.linspace(0, 2 * np.pi, 12, endpoint=False):
-        pose = outside_pose(scene, camera, azimuth_rad=float(azimuth))
+        pose = outside_pose(sketch, camera, azimuth_rad=float(azimuth))
         shown = scene.cloud.select(facing(scene.cloud, scene.seen, pose[:3, 3]))
         poses.append(pose)
         scores.append(float(rasteriser.render(shown, small, pose).alpha.mean()))
