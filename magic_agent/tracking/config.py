@@ -92,12 +92,16 @@ class AdamConfig:
 class LostConfig:
     """When a pose is not to be believed."""
 
-    min_inlier_share: float = 0.4
-    """Least share of visible depths that agree with the sub-map."""
+    min_inlier_share: float = 0.6
+    """Least share of visible depths that agree with the sub-map, by the sensor's noise."""
     min_visible_share: float = 0.1
     """Least share of the image that shows known parts of the sub-map."""
-    max_colour_error: float = 0.15
-    """Largest median colour residual, in units of full scale, after gain and bias."""
+    max_colour_error: float = 0.04
+    """Colour residuals up to this deviation are never a reason, in units of full scale."""
+    max_colour_growth: float = 2.5
+    """Colour residuals beyond this many times their recent level do not show the same place."""
+    max_gain: float = 2.5
+    """Largest step of exposure between frame and sub-map, up or down; more is no likeness."""
     max_jump_m: float = 0.35
     """Largest translation between consecutive frames."""
     max_turn_deg: float = 25.0

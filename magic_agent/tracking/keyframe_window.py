@@ -55,7 +55,7 @@ class KeyframeWindow:
             View(
                 kept.pyramid,
                 anchor_from_last @ se3.inverse(kept.keyframe_from_last),
-                finest=self._config.finest_level,
+                finest=min(self._config.finest_level, len(kept.pyramid) - 1),
             )
             for kept in self._kept
         ]
@@ -85,4 +85,4 @@ class KeyframeWindow:
         self._last = frame
 
     def _reference(self, image: Pyramid) -> Pyramid:
-        return keyframe_pyramid(image, finest=self._config.finest_level)
+        return keyframe_pyramid(image, finest=min(self._config.finest_level, len(image) - 1))

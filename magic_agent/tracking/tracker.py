@@ -24,6 +24,7 @@ from magic_agent.tracking.refinement import (
     ReferenceView,
     Refinement,
     Refiner,
+    contrast,
 )
 from magic_agent.tracking.relocalisation import Relocaliser
 from magic_agent.tracking.result import StageClock, TrackingResult
@@ -51,6 +52,7 @@ class Tracker:
         self._refiner = _make_refiner(self._config)
         self._window = KeyframeWindow(self._config.window)
         self._relocaliser: Relocaliser | None = None
+        self._usual_colour_error: float | None = None
 
     @property
     def config(self) -> TrackingConfig:
@@ -161,6 +163,11 @@ class Tracker:
             logger.debug("frame %d: initialisation failed, using the prediction", frame.index)
         return initial
 
+    def _note_colour_error(self, error: float) -> None:
+        """Follow the usual colour error slowly."""
+        usual = self._usual_colour_error
+        self._usual_colour_error = error if usual is None else usual + 0.1 * (error - usual)
+
     def _result(
         self,
         frame: Frame,
@@ -177,10 +184,13 @@ class Tracker:
             refinement,
             previous_from_camera=se3.inverse(anchor_from_previous) @ alignment.anchor_from_camera,
             prior=prior,
+            usual_colour_error=self._usual_colour_error,
             config=self._config.lost,
         )
         lost = judgement.verdict == "lost"
         fit = alignment.fits[0]
+        if not lost and contrast(frame) >= self._config.lost.min_contrast:
+            self._note_colour_error(fit.model.colour_sigma)
         return TrackingResult(
             anchor_from_camera=(
                 anchor_from_previous @ predicted if lost else alignment.anchor_from_camera

@@ -31,6 +31,7 @@ def judge(
     *,
     previous_from_camera: NDArray[np.float64],
     prior: NDArray[np.float64],
+    usual_colour_error: float | None,
     config: LostConfig,
 ) -> Judgement:
     """Lost where the view does not fit, or the motion is impossible; degenerate where some
@@ -44,6 +45,7 @@ def judge(
         previous_from_camera=previous_from_camera,
         inlier_share=inlier_share,
         visible_share=visible_share,
+        usual_colour_error=usual_colour_error,
         config=config,
     )
     verdict: Verdict = "lost" if reason else "ok"
@@ -67,6 +69,7 @@ def _why_lost(
     previous_from_camera: NDArray[np.float64],
     inlier_share: float,
     visible_share: float,
+    usual_colour_error: float | None,
     config: LostConfig,
 ) -> str:
     """The first reason not to believe the pose, or an empty string."""
@@ -85,7 +88,22 @@ def _why_lost(
         return f"only {visible_share:.0%} of the image shows the sub-map"
     if has_depth and inlier_share < config.min_inlier_share:
         return f"only {inlier_share:.0%} of the depths agree with the sub-map"
-    colour_error = refinement.alignment.fits[0].model.colour_sigma
-    if has_colour and colour_error > config.max_colour_error:
-        return f"colour residuals of {colour_error:.2f}"
+    return _why_colours_differ(refinement, usual_colour_error, config) if has_colour else ""
+
+
+def _why_colours_differ(
+    refinement: Refinement, usual_error: float | None, config: LostConfig
+) -> str:
+    """Why the colours do not show the same place, or an empty string."""
+    fit = refinement.alignment.fits[0]
+    error = fit.model.colour_sigma
+    limit = config.max_colour_error
+    if usual_error is not None:
+        limit = max(limit, config.max_colour_growth * usual_error)
+    else:
+        limit *= 3.0  # nothing to compare with yet
+    if error > limit:
+        return f"colour residuals of {error:.3f}, at most {limit:.3f} expected"
+    if not 1.0 / config.max_gain <= fit.gain <= config.max_gain:
+        return f"colours match only with a gain of {fit.gain:.2f}"
     return ""

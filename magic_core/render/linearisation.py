@@ -92,8 +92,9 @@ class ResidualModel:
     """Factor on depth information."""
     gate: float = 50.0
     """Depth residuals beyond this many standard deviations leave their pixel out."""
-    agree: float = 5.0
-    """Depth residuals within this many standard deviations count as agreeing."""
+    agree: float = 3.5
+    """Depth residuals within this many deviations count as agreeing; the noise model's own ones,
+    not scaled by `depth_sigma`, or else any two surfaces would agree."""
     depth_step: float = 0.05
     """Neighbouring depths that differ by more than this share of the depth are an edge: unused."""
 
@@ -115,7 +116,7 @@ class NormalEquations:
     measured: float
     """Soft count of those where both views have a depth."""
     agreeing: float
-    """Soft count of those whose depths agree within `ResidualModel.agree` deviations."""
+    """Soft count of those whose depths agree, by `ResidualModel.agree`."""
 
     @property
     def mean_cost(self) -> float:
@@ -226,7 +227,7 @@ def _packed_model(model: ResidualModel) -> Float32:
             model.k0_m, model.k2_per_m, model.k_slope**2,
             1.0 / model.colour_width**2, 1.0 / model.depth_width**2,
             model.colour_weight, model.depth_weight,
-            model.gate**2, model.agree**2, model.depth_step,
+            model.gate**2, (model.agree / model.depth_sigma) ** 2, model.depth_step,
         ],
         np.float32,
     )  # fmt: skip

@@ -71,6 +71,17 @@ def test_tracks_a_walk_against_the_sub_map(view, config):
         assert error_mm(pose, TRUTH[current.index]) < 12.0  # 2 to 6 measured at 2 cm per pixel
 
 
+@pytest.mark.parametrize("levels", [1, 2])
+def test_works_with_few_pyramid_levels(view, levels):
+    config = replace(CONFIG, gauss_newton=GaussNewtonConfig(levels=levels))
+    result = Tracker(CAMERA, config).track(
+        FRAMES[2], FRAMES[1], anchor_from_previous=TRUTH[1],
+        anchor_from_before_previous=TRUTH[0], reference=view,
+    )  # fmt: skip
+    assert result.verdict == "ok", result.reason
+    assert error_mm(result.anchor_from_camera, TRUTH[2]) < 12.0
+
+
 @pytest.mark.parametrize(
     ("colour", "depth"), [(True, False), (False, True)], ids=["black", "no depth"]
 )
@@ -102,9 +113,11 @@ def test_a_frame_that_shows_nothing_is_lost_and_keeps_the_prediction(view):
     assert np.allclose(result.anchor_from_camera, predicted, atol=1e-9)
 
 
-def test_a_kidnapped_camera_is_lost_not_moved(view):
-    elsewhere = ANCHOR @ se3.exp([0.5, 0.2, -0.3, 0.2, np.pi, 0.1])  # the wall behind
+@pytest.mark.parametrize("turn", [0.5, 1.0, 0.25])
+def test_a_kidnapped_camera_is_lost_not_moved(view, turn):
+    elsewhere = ANCHOR @ se3.exp([0.3, 0.1, -0.2, 0.1, turn * np.pi, 0.1])  # another wall
     tracker = Tracker(CAMERA, CONFIG)
+    tracker.track(FRAMES[1], FRAMES[0], anchor_from_previous=TRUTH[0], reference=view)
     result = tracker.track(
         room_frame(elsewhere, 2, noise_seed=50),
         FRAMES[1],
