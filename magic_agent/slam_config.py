@@ -25,9 +25,9 @@ class SubmapConfig:
     """Usable frames in a row without a pose before a new sub-map starts without odometry."""
     min_depth_share: float = 0.1
     """Share of pixels with depth below which a frame cannot be used."""
-    drift_translation_m: float = 0.002
+    drift_translation_m: float = 0.004
     """Standard deviation that one hand-over adds to the odometry edge, metres."""
-    drift_rotation_deg: float = 0.05
+    drift_rotation_deg: float = 0.1
     """Standard deviation that one hand-over adds to the odometry edge, degrees."""
 
     def validate(self) -> None:
