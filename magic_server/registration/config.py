@@ -23,8 +23,9 @@ class RegistrationConfig:
     max_hypotheses: int = 3
     """Hypotheses per method that are refined and compared."""
 
-    max_keyframes: int = 0
-    """How many images besides the anchor's are used, where the view has them."""
+    max_keyframes: int = 2
+    """How many images besides the anchor's are used, where the view has them: two find a third
+    more loops than the anchors alone."""
     max_depth_m: float = 6.0
     """Farther readings are ignored."""
     max_width: int = 360

@@ -9,7 +9,7 @@ import pytest
 
 from magic_core.errors import CorruptData, DataError
 from magic_core.geometry import se3
-from magic_server.posegraph.files import solve_files
+from magic_server.posegraph.solve_files import solve_files
 from magic_server.posegraph.g2o import problem_of, read_g2o, write_g2o
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "g2o"
