@@ -9,8 +9,8 @@ import pytest
 
 from magic_core.errors import CorruptData, DataError
 from magic_core.geometry import se3
-from magic_server.posegraph.solve_files import solve_files
 from magic_server.posegraph.g2o import problem_of, read_g2o, write_g2o
+from magic_server.posegraph.solve_files import solve_files
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "g2o"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"{DATA} is absent")
