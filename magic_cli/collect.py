@@ -9,13 +9,13 @@ import numpy as np
 
 from magic_agent.client import MagicClient
 from magic_core.data import FrameSource
-from magic_core.data.sequence import FileSequence
 from magic_core.evaluation import (
     Components,
     LoopRecord,
     PlacedAnchor,
     RunFolder,
     Trajectory,
+    ground_truth_of,
 )
 from magic_core.evaluation.records import agent_of, index_of
 from magic_core.wire import geometry, names, records
@@ -53,19 +53,9 @@ async def collect_map(
 def write_ground_truth(folder: RunFolder, sources: list[FrameSource]) -> None:
     """Write each source's ground truth where it has one. For evaluation alone."""
     for source in sources:
-        poses = ground_truth(source)
-        if len(poses):
+        poses = ground_truth_of(source)
+        if poses is not None and len(poses):
             folder.write_trajectory(source.name, "ground_truth", poses)
-
-
-def ground_truth(source: FrameSource) -> Trajectory:
-    """The poses that came with the data; empty when it has none. Files need no image read."""
-    timed = source.files if isinstance(source, FileSequence) else iter(source)
-    return Trajectory.from_poses(
-        (item.timestamp_s, item.world_from_camera)
-        for item in timed
-        if item.world_from_camera is not None
-    )
 
 
 def components_of(snapshot: records.PoseSnapshot) -> Components:

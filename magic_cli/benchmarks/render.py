@@ -1,8 +1,7 @@
-"""`magic bench render`: forward and backward of the rasteriser, in milliseconds and as ratios.
+"""`magic bench render`: forward and backward of the rasteriser, and what stands beside it.
 
-Examples:
-  magic bench render
-  magic bench render --against PROTOTYPE_FOLDER --json
+`--against` times the prototype in the same process, in turns. Further figures: a whole mapping
+iteration, the 8-lane path, the torch reference, and the share of the processor's peak.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ class RenderBenchmark:
     """Options of `magic bench render`."""
 
     against: Path | None = None
-    """Folder of the prototype (ngs.py) to time in the same run."""
+    """Folder of a prototype (ngs.py) to time in the same run."""
     repeats: int = 15
-    """Interleaved runs per cell; medians are reported."""
-    quick: bool = False
-    """Only the smallest cell, and none of the extra figures."""
+    """Runs of each cell, in turns; medians are printed."""
+    extras: bool = True
+    """Measure the four further figures too."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -31,31 +30,33 @@ class RenderBenchmark:
 def main(arguments: list[str]) -> int:
     """Run the benchmark and print its table."""
     config = parse(RenderBenchmark, arguments, prog="magic bench render", description=__doc__ or "")
-    from magic_core.render import benchmark
+    from magic_core.render.benchmark import run
 
-    cells = benchmark.CELLS[:1] if config.quick else benchmark.CELLS
-    result = benchmark.run(
-        config.against,
-        repeats=config.repeats,
-        cells=cells,
-        extras=not config.quick,
-        progress=lambda text: console.print(text, markup=False),
-    )
-    console.print(_table(result["cells"]))
+    with console.status("timing") as status:
+        result = run(
+            config.against, repeats=config.repeats, extras=config.extras, progress=status.update
+        )
+    rows = [
+        [
+            f"{cell['size']}, {cell['gaussians']:,}",
+            str(cell["threads"]),
+            _number(cell["forward_ms"]),
+            _number(cell["forward_backward_ms"]),
+            _number(cell["against_forward_backward_ms"]),
+            _number(cell["ratio"]),
+        ]
+        for cell in result["cells"]
+    ]
+    columns = ["image, Gaussians", "threads", "forward ms", "+ backward ms", "against ms", "ratio"]
+    console.print(table("Rasteriser, medians", columns, rows))
+    others = [[name, _number(value)] for name, value in result.items() if name != "cells"]
+    console.print(table("Beside it", ["figure", "value"], others))
     if config.json:
         print_json(result)
     return 0
 
 
-def _table(cells: list[dict]):
-    rows = [
-        [
-            f"{cell['size']} {cell['gaussians'] // 1000}k", str(cell["threads"]),
-            f"{cell['forward_ms']:.2f}", f"{cell['forward_backward_ms']:.2f}",
-            "" if cell["ratio"] is None else f"{cell['against_forward_backward_ms']:.2f}",
-            "" if cell["ratio"] is None else f"{cell['ratio']:.3f}",
-        ]
-        for cell in cells
-    ]  # fmt: skip
-    columns = ["cell", "threads", "forward ms", "forward+backward ms", "against ms", "ratio"]
-    return table("rasteriser", columns, rows)
+def _number(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if isinstance(value, (int, float)) else str(value)

@@ -84,10 +84,8 @@ def test_a_saved_run_config_is_accepted_back(tmp_path):
 def test_json_is_the_last_line_of_stdout(capsys, tmp_path):
     folder = tmp_path / "empty"
     folder.mkdir()
-    code = run_command(["check-data", str(folder), "--json"])
-    assert code == 1
-    captured = capsys.readouterr()
-    if captured.out:
-        assert json.loads(captured.out.strip().splitlines()[-1])["ok"] is False
-    else:
-        assert "empty" in captured.err
+    assert run_command(["check-data", str(folder), "--json"]) == 1
+    report = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert report["ok"] is False
+    failed = [found["detail"] for found in report["findings"] if found["status"] == "fail"]
+    assert any("empty" in detail for detail in failed)
