@@ -17,6 +17,7 @@ from magic_cli.output import console, print_json
 from magic_cli.run import RunConfig, run
 from magic_core.config import field_names
 from magic_core.data.synthetic import SyntheticConfig
+from magic_server.globalmap import MergeConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +29,8 @@ class DemoConfig(RunConfig):
     """Where the generated sequences lie; they are made once."""
     only_data: bool = False
     """Generate the sequences and stop."""
+    merge: MergeConfig = field(default_factory=lambda: MergeConfig(passes=8))
+    """Server: how the global map is made; the flat needs fewer passes than real images."""
     flat: SyntheticConfig = field(default_factory=SyntheticConfig)
     """The flat and the walks through it."""
 

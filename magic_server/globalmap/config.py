@@ -15,10 +15,11 @@ class MergeConfig:
     """Run the fine stage; without it the merged map is the sub-maps appended."""
     iterations: int = 3000
     """Most optimisation steps of the fine stage (the paper's 3,000)."""
-    passes: int = 5
+    passes: int = 30
     """Most visits per keyframe on average; the smaller of both budgets counts."""
-    converged: float = 0.01
-    """Converged when a pass over the keyframes lowers the mean loss by less than this share."""
+    converged: float = 0.004
+    """Converged when a keyframe's loss falls by less than this share from visit to visit, on the
+    mean of a pass."""
     fill: bool = True
     """Seed Gaussians where the keyframes see surface that the appended sub-maps do not show."""
     fill_unmeasured: bool = True

@@ -52,6 +52,7 @@ class FineStage:
         self._optimiser, self._views, self._config = optimiser, views, config
         self._progress = progress
         self._order = VisitOrder(region_weights(views), np.random.default_rng(config.seed))
+        self._last_loss = np.full(len(views), np.nan)
         self._steps_per_pass = max(len(views), _MIN_STEPS_PER_PASS)
         self._budget = min(config.iterations, config.passes * self._steps_per_pass)
 
@@ -59,35 +60,42 @@ class FineStage:
         """Fill, optimise and prune until the loss settles or the budget is spent."""
         pruned = self._prune_unseen(_HIDDEN_SHARE * self._config.min_contribution, share=0.01)
         filled = self._fill()
-        done, previous, deduplicated, converged = 0, float("inf"), False, False
+        done, deduplicated, converged = 0, False, False
         while done < self._budget and not converged:
             steps = min(self._steps_per_pass, self._budget - done)
-            loss = self._pass(steps, done)
+            loss, gain = self._pass(steps, done)
             done += steps
             pruned += self._prune_faded()
             self._progress(self._share(done), f"refined {done} of {self._budget} steps: {loss:.4f}")
-            settled = previous - loss < self._config.converged * loss
-            converged, previous = settled and deduplicated, loss
+            settled = gain < self._config.converged
+            converged = settled and deduplicated
             if not deduplicated and (settled or done >= _DEDUPLICATE_AT * self._budget):
                 pruned += self._prune_unseen(self._config.min_contribution, share=self._share(done))
                 # The loss rises for a moment: it has to settle anew.
-                deduplicated, previous = True, float("inf")
+                deduplicated = True
+                self._last_loss[:] = np.nan
         return FineResult(done, converged, filled, pruned)
 
     def _share(self, done: int) -> float:
         return 0.1 + 0.88 * done / max(self._budget, 1)
 
-    def _pass(self, steps: int, done: int) -> float:
-        """Mean loss of `steps` steps."""
+    def _pass(self, steps: int, done: int) -> tuple[float, float]:
+        """Mean loss of `steps` steps, and the mean share by which a view's loss fell since its
+        last visit (infinite before any second visit). Views differ more than passes do, so only a
+        view's own loss tells whether the map still gets better."""
         self._optimiser.learning_rates = rates(self._config, done / max(self._budget, 1))
-        losses = []
+        losses, gains = [], []
         for _ in range(steps):
-            view = self._views[self._order.next()]
-            report = self._optimiser.step(
+            index = self._order.next()
+            view = self._views[index]
+            loss = self._optimiser.step(
                 view.camera, view.world_from_camera, view.colour, view.depth
-            )
-            losses.append(report.loss)
-        return float(np.mean(losses))
+            ).loss
+            if np.isfinite(self._last_loss[index]):
+                gains.append(1.0 - loss / max(self._last_loss[index], 1e-12))
+            self._last_loss[index] = loss
+            losses.append(loss)
+        return float(np.mean(losses)), float(np.mean(gains)) if gains else float("inf")
 
     def _fill(self) -> int:
         limits = {
