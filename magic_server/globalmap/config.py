@@ -17,7 +17,7 @@ class MergeConfig:
     """Most optimisation steps of the fine stage (the paper's 3,000)."""
     passes: int = 30
     """Most visits per keyframe on average; the smaller of both budgets counts."""
-    converged: float = 0.004
+    converged: float = 0.002
     """Converged when a keyframe's loss falls by less than this share from visit to visit, on the
     mean of a pass."""
     fill: bool = True
