@@ -41,7 +41,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_reports_accuracy_and_time_of_a_solver_as_json(recording):
     lines = []
-    config = SlamConfig(submap=SubmapConfig(frames=5, min_frames=3))  # so that the walk crosses a seam
+    # Short sub-maps, so that the walk crosses a seam.
+    config = SlamConfig(submap=SubmapConfig(frames=5, min_frames=3))
     report = benchmark.run(
         recording, scale=1.0, solvers=("gn",), config=config, progress=lines.append
     )
