@@ -14,12 +14,12 @@ class MergeConfig:
     refine: bool = True
     """Run the fine stage; without it the merged map is the sub-maps appended."""
     iterations: int = 3000
-    """Most optimisation steps of the fine stage (the paper's 3,000)."""
+    """Most optimisation steps of the fine stage (the paper takes 3,000)."""
     passes: int = 30
     """Most visits per keyframe on average; the smaller of both budgets counts."""
-    converged: float = 0.002
-    """Converged when a keyframe's loss falls by less than this share from visit to visit, on the
-    mean of a pass."""
+    converged: float = 0.0
+    """Stop early when a keyframe's loss falls by less than this share from visit to visit, on the
+    mean of a pass; 0 spends the budget, which real images repay."""
     fill: bool = True
     """Seed Gaussians where the keyframes see surface that the appended sub-maps do not show."""
     fill_unmeasured: bool = True

@@ -67,7 +67,7 @@ class FineStage:
             done += steps
             pruned += self._prune_faded()
             self._progress(self._share(done), f"refined {done} of {self._budget} steps: {loss:.4f}")
-            settled = gain < self._config.converged
+            settled = self._config.converged > 0.0 and gain < self._config.converged
             converged = settled and deduplicated
             if not deduplicated and (settled or done >= _DEDUPLICATE_AT * self._budget):
                 pruned += self._prune_unseen(self._config.min_contribution, share=self._share(done))
@@ -81,8 +81,8 @@ class FineStage:
 
     def _pass(self, steps: int, done: int) -> tuple[float, float]:
         """Mean loss of `steps` steps, and the mean share by which a view's loss fell since its
-        last visit (infinite before any second visit). Views differ more than passes do, so only a
-        view's own loss tells whether the map still gets better."""
+        last visit (infinite while most views have not been visited twice). Views differ more
+        than passes do, so only a view's own loss tells whether the map still gets better."""
         self._optimiser.learning_rates = rates(self._config, done / max(self._budget, 1))
         losses, gains = [], []
         for _ in range(steps):
@@ -95,7 +95,8 @@ class FineStage:
                 gains.append(1.0 - loss / max(self._last_loss[index], 1e-12))
             self._last_loss[index] = loss
             losses.append(loss)
-        return float(np.mean(losses)), float(np.mean(gains)) if gains else float("inf")
+        known = len(gains) >= 0.5 * steps
+        return float(np.mean(losses)), float(np.mean(gains)) if known else float("inf")
 
     def _fill(self) -> int:
         limits = {
