@@ -1,14 +1,14 @@
 """The one error tree of magic-slam.
 
     MagicError                      UNKNOWN
-    ├── InvalidInput                INVALID_ARGUMENT     a value breaks a stated rule (field violations)
+    ├── InvalidInput                INVALID_ARGUMENT     a value breaks a stated rule
     │   └── ConfigError             INVALID_ARGUMENT     a setting is unknown or out of range
     ├── DataError                   FAILED_PRECONDITION  a dataset is missing or not in its layout
     ├── NotFound                    NOT_FOUND            a named thing does not exist
     ├── AlreadyExists               ALREADY_EXISTS       a name is taken by something else
     ├── WrongState                  FAILED_PRECONDITION  the thing exists but cannot do this now
-    │   └── DescriptorModelMismatch FAILED_PRECONDITION  agent and session use different image encoders
-    ├── CorruptData                 DATA_LOSS            bytes do not match their checksum or format
+    │   └── DescriptorModelMismatch FAILED_PRECONDITION  another image encoder
+    ├── CorruptData                 DATA_LOSS            bytes do not match checksum or format
     ├── ResourceExhausted           RESOURCE_EXHAUSTED   a limit or quota is reached
     ├── Unavailable                 UNAVAILABLE          try again later
     ├── DeadlineExceeded            DEADLINE_EXCEEDED    the answer did not come in time

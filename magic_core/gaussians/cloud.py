@@ -50,7 +50,8 @@ class GaussianCloud:
         """All Gaussians of several clouds of one frame, in order."""
         if not clouds:
             return cls.empty()
-        return cls(*(np.concatenate(parts) for parts in zip(*(c.arrays() for c in clouds))))
+        columns = zip(*(cloud.arrays() for cloud in clouds), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
 
     def arrays(self) -> tuple[Float32, Float32, Float32, Float32, Float32]:
         """(means, quaternions, scales, opacities, colours)."""
