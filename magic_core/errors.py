@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class FieldViolation:
-    """One field that breaks its rule: a dotted path and a sentence saying value, rule and remedy."""
+    """One field that breaks its rule: a dotted path; value, rule and remedy in a sentence."""
 
     field: str
     description: str

@@ -68,8 +68,8 @@ def rotation_log(rotation: ArrayLike) -> Array:
     vector = np.array(xyz)
     norm = float(np.linalg.norm(vector))
     if norm < 1e-12:
-        return 2.0 * vector / max(w, 1e-12)
-    return vector * (2.0 * np.arctan2(norm, w) / norm)
+        return 2.0 * vector / max(float(w), 1e-12)
+    return vector * float(2.0 * np.arctan2(norm, w) / norm)
 
 
 def exp(xi: ArrayLike) -> Array:
@@ -83,7 +83,7 @@ def log(transform: ArrayLike) -> Array:
     transform = np.asarray(transform, dtype=np.float64)
     phi = rotation_log(transform[:3, :3])
     rho = np.linalg.solve(_left_jacobian(phi), transform[:3, 3])
-    return np.concatenate([rho, phi])
+    return np.concatenate([rho, phi]).astype(np.float64)
 
 
 def adjoint(transform: ArrayLike) -> Array:
