@@ -120,7 +120,7 @@ class GaussianOptimiser:
 
     def render(self, camera: Camera, world_from_camera: ArrayLike) -> RenderedView:
         """Render the cloud as it is."""
-        return self._rasteriser.render(self.gaussians(), camera, world_from_camera)
+        return self._rasteriser.render_flat(self._active(), camera, world_from_camera)
 
     def step(
         self,

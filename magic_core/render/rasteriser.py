@@ -105,9 +105,15 @@ class Rasteriser:
         self, cloud: GaussianCloud, camera: Camera, world_from_camera: ArrayLike
     ) -> RenderedView:
         """Render the cloud, given in the frame called world here."""
+        return self.render_flat(tuple(_flat(a) for a in cloud.arrays()), camera, world_from_camera)
+
+    def render_flat(
+        self, parameters: tuple[Float32, ...], camera: Camera, world_from_camera: ArrayLike
+    ) -> RenderedView:
+        """Like `render`, for flat parameter arrays as in `forward`."""
         _check_size(camera)
-        image = self.forward(tuple(_flat(a) for a in cloud.arrays()), camera, world_from_camera)
-        n = len(cloud)
+        image = self.forward(parameters, camera, world_from_camera)
+        n = len(parameters[3])
         radii = self.records.reshape(-1, RECORD)[:n, layout.RADIUS]
         return RenderedView(
             image=image.copy(),
