@@ -210,9 +210,7 @@ def test_sidecar_with_unknown_setting_is_refused(tmp_path):
         load_descriptor_model(str(path))
 
 
-@pytest.mark.parametrize(
-    ("pooling", "expected"), [("mean", [0.6, 0.8]), ("first", [1.0, 0.0])]
-)
+@pytest.mark.parametrize(("pooling", "expected"), [("mean", [0.6, 0.8]), ("first", [1.0, 0.0])])
 def test_pooling_of_tokens(pooling, expected):
     tokens = np.array([[[3.0, 0.0], [0.0, 4.0]]], dtype=np.float32)
     np.testing.assert_allclose(Preprocessing(pooling=pooling).pool(tokens), expected, atol=1e-6)
