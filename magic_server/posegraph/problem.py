@@ -34,9 +34,9 @@ class PoseGraphConfig:
     """`gnc` finds and leaves out wrong loops, `none` trusts every edge."""
     inlier_probability: float = 0.999
     """A right loop's squared Mahalanobis norm is below the chi-square quantile of this."""
-    odometry_floor_m: float = 0.003
+    odometry_floor_m: float = 0.01
     """Added to the tracker's standard deviation per edge: its own is optimistic."""
-    odometry_floor_rad: float = 0.002
+    odometry_floor_rad: float = 0.005
     """The same for rotation."""
     odometry_floor_share: float = 0.01
     """Added per metre and per radian of motion along the edge: drift grows with motion."""

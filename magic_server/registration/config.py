@@ -23,9 +23,9 @@ class RegistrationConfig:
     max_hypotheses: int = 3
     """Hypotheses per method that are refined and compared."""
 
-    max_keyframes: int = 2
-    """How many images besides the anchor's are used, where the view has them: two find a third
-    more loops than the anchors alone."""
+    max_keyframes: int = 4
+    """How many images besides the anchor's are used, where the view has them: four find half as
+    many loops again as the anchors alone, and all of them bear witness in verification."""
     max_depth_m: float = 6.0
     """Farther readings are ignored."""
     max_width: int = 360
@@ -45,9 +45,13 @@ class RegistrationConfig:
     """Noise of the contrast-normalised intensity (which has standard deviation about 1)."""
     correlated_pixels: float = 60.0
     """Neighbouring residuals are not independent: so many count as one in the information."""
-    systematic_m: float = 0.003
+    systematic_m: float = 0.005
     """Error of translation that no number of pixels averages out."""
-    systematic_rad: float = 0.0015
+    systematic_rad: float = 0.003
+    """The same for rotation."""
+    keyframe_drift_m: float = 0.004
+    """Added where keyframes take part: the tracker drifts within their sub-maps."""
+    keyframe_drift_rad: float = 0.002
     """The same for rotation."""
 
     min_inliers: int = 4
@@ -60,7 +64,9 @@ class RegistrationConfig:
     """Largest point-to-plane root mean square of agreeing readings."""
     min_texture_correlation: float = 0.5
     """Least correlation of contrast-normalised intensity where both views agree in depth."""
-    max_free_space: float = 0.06
+    min_colour_correlation: float = 0.5
+    """Least correlation of the opponent colours there, where the place has colours."""
+    max_free_space: float = 0.04
     """Largest share of readings that stand in space which the other view saw through."""
     min_information: float = 100.0
     """Least eigenvalue of the information, 1/m^2 and 1/rad^2 (100: 10 cm, 0.1 rad)."""

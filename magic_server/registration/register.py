@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magic_server.registration.coarse import Hypothesis, coarse_method
 from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.refine import FramePair, Pyramids, Refined, refine
-from magic_server.registration.verify import Figures, figures_of, refusal
+from magic_server.registration.verify import Figures, figures_of, refusal, strictest
 from magic_server.registration.view import AnchorView, PreparedView, prepare
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ ACCEPTED = "ACCEPTED"
 NO_HYPOTHESIS = "NO_HYPOTHESIS"
 MAX_FRAME_PAIRS = 4
 LEAST_PAIR_OVERLAP = 0.1
-NO_FIGURES = Figures(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_FIGURES = Figures(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class RegistrationResult:
     accepted: bool
     reason: str
     """ACCEPTED, or why not: NO_HYPOTHESIS, FEW_INLIERS, LOW_OVERLAP, LOW_FITNESS, HIGH_RMSE,
-    FREE_SPACE, TEXTURE_MISMATCH, DEGENERATE."""
+    FREE_SPACE, TEXTURE_MISMATCH, COLOUR_MISMATCH, DEGENERATE."""
     target_from_source: Array
     """(4, 4): maps points in the source's anchor frame to the target's."""
     information: Array
@@ -66,16 +66,22 @@ def register(
     best = _best_candidate(source, target, config)
     if best is None:
         return _result(NO_HYPOTHESIS, None, clock() - started)
-    information = loop_information(best.refined.hessian, config)
-    return _result(best.refusal(config) or ACCEPTED, best, clock() - started, information)
+    reason = best.refusal(config) or ACCEPTED
+    return _result(reason, best, clock() - started, best.information(config))
 
 
-def loop_information(hessian: Array, config: RegistrationConfig) -> Array:
+def loop_information(
+    hessian: Array, config: RegistrationConfig, *, by_anchors: bool = True
+) -> Array:
     """The information of a loop edge from the Gauss-Newton matrix of all pixels.
 
     Neighbouring pixels err together, and calibration and surface bias do not average out.
     """
-    systematic = np.diag([config.systematic_m**2] * 3 + [config.systematic_rad**2] * 3)
+    variance_m2, variance_rad2 = config.systematic_m**2, config.systematic_rad**2
+    if not by_anchors:
+        variance_m2 += config.keyframe_drift_m**2
+        variance_rad2 += config.keyframe_drift_rad**2
+    systematic = np.diag([variance_m2] * 3 + [variance_rad2] * 3)
     scaled = hessian / config.correlated_pixels
     # (S + M^-1)^-1 without inverting M, which may be singular: M (S M + I)^-1.
     information = scaled @ np.linalg.inv(systematic @ scaled + np.eye(6))
@@ -91,8 +97,13 @@ class _Candidate:
 
     def refusal(self, config: RegistrationConfig) -> str:
         """The reason code of the first gate that fails; empty if all pass."""
-        information = loop_information(self.refined.hessian, config)
-        return refusal(self.figures, self.hypothesis.inliers, information, config)
+        inliers = self.hypothesis.inliers
+        return refusal(self.figures, inliers, self.information(config), config)
+
+    def information(self, config: RegistrationConfig) -> Array:
+        """Of target_from_source, (6, 6)."""
+        by_anchors = self.pairs == (FramePair(0, 0),)
+        return loop_information(self.refined.hessian, config, by_anchors=by_anchors)
 
 
 def _best_candidate(
@@ -143,28 +154,39 @@ def _coarsely_refined(
 def _finely_refined(
     a: Pyramids, b: Pyramids, candidate: _Candidate, config: RegistrationConfig
 ) -> _Candidate:
+    """At full size, by the pairs of images that see most of each other, keyframes included:
+    that spreads the tracker's drift within the sub-maps, where anchors alone would be nearer to
+    each other and leave the rest of both trajectories farther off (measured on whole runs)."""
     start = candidate.refined.target_from_source
-    pairs = _overlapping_pairs(a, b, start, config.pyramid_levels - 1) or candidate.pairs
+    coarsest = config.pyramid_levels - 1
+    pairs = _overlapping_pairs(a, b, start, coarsest) or candidate.pairs
     refined = refine(a, b, start, pairs=pairs, levels=(0,), config=config)
     figures = figures_of(a, b, refined.target_from_source, pairs=pairs, level=0)
-    return _Candidate(candidate.hypothesis, refined, figures, pairs)
+    everything = figures_of(
+        a, b, refined.target_from_source, pairs=_all_pairs(a, b), level=min(coarsest, 1)
+    )
+    return _Candidate(candidate.hypothesis, refined, strictest(figures, everything), pairs)
 
 
 def _overlapping_pairs(
     a: Pyramids, b: Pyramids, target_from_source: Array, level: int
 ) -> tuple[FramePair, ...]:
     """The pairs of images that see most of each other."""
-    everything = [
-        FramePair(i, j) for i in range(len(a.view.frames)) for j in range(len(b.view.frames))
-    ]
+    everything = _all_pairs(a, b)
     if len(everything) == 1:
-        return tuple(everything)
+        return everything
     overlaps = [
         figures_of(a, b, target_from_source, pairs=(pair,), level=level).overlap
         for pair in everything
     ]
     order = np.argsort(-np.array(overlaps), kind="stable")[:MAX_FRAME_PAIRS]
     return tuple(everything[i] for i in order if overlaps[i] >= LEAST_PAIR_OVERLAP)
+
+
+def _all_pairs(a: Pyramids, b: Pyramids) -> tuple[FramePair, ...]:
+    return tuple(
+        FramePair(i, j) for i in range(len(a.view.frames)) for j in range(len(b.view.frames))
+    )
 
 
 def _result(

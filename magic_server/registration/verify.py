@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.refine import FramePair, Pyramids, Sampling
 
 Array = NDArray[np.float64]
+
+
+LEAST_COLOUR_SPREAD = 0.02
+"""Below this, colours are noise and their correlation says nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,8 @@ class Figures:
     """Correlation of contrast-normalised intensity over the agreeing readings, -1 to 1."""
     colour_correlation: float
     """Correlation of the opponent colours R-G and G-B over the agreeing readings."""
+    colour_spread: float
+    """Their standard deviation, the smaller of the two views (0 to 1); grey places have none."""
     free_space: float
     """Share of compared readings that stand in space the other view saw through."""
 
@@ -70,7 +76,18 @@ def figures_of(
         overlap=float(max(shares, default=0.0)),
         texture_correlation=_correlation(totals[projective.TEXTURE_SUMS]),
         colour_correlation=_correlation(totals[projective.COLOUR_SUMS]),
+        colour_spread=_spread(totals[projective.COLOUR_SUMS]),
         free_space=float(totals[projective.IN_FRONT] / compared),
+    )
+
+
+def strictest(chosen: Figures, everything: Figures) -> Figures:
+    """The figures of the images that see most of each other, but no contradiction forgotten:
+    free space and colour as the worse of theirs and of all pairs of images."""
+    return replace(
+        chosen,
+        free_space=max(chosen.free_space, everything.free_space),
+        colour_correlation=min(chosen.colour_correlation, everything.colour_correlation),
     )
 
 
@@ -83,6 +100,11 @@ def refusal(figures: Figures, inliers: int, information: Array, config: Registra
         ("HIGH_RMSE", figures.rmse_m <= config.max_rmse_m),
         ("FREE_SPACE", figures.free_space <= config.max_free_space),
         ("TEXTURE_MISMATCH", figures.texture_correlation >= config.min_texture_correlation),
+        (
+            "COLOUR_MISMATCH",
+            figures.colour_spread < LEAST_COLOUR_SPREAD
+            or figures.colour_correlation >= config.min_colour_correlation,
+        ),
         ("DEGENERATE", np.linalg.eigvalsh(information)[0] >= config.min_information),
     )
     return next((reason for reason, passed in gates if not passed), "")
@@ -106,3 +128,10 @@ def _correlation(sums: Array) -> float:
     if min(spread_a, spread_b) < 1e-9:
         return 0.0
     return float((ab / count - a * b / count**2) / np.sqrt(spread_a * spread_b))
+
+
+def _spread(sums: Array) -> float:
+    count, a, b, aa, bb, _ = sums
+    count = max(count, 1.0)
+    least = min(aa / count - (a / count) ** 2, bb / count - (b / count) ** 2)
+    return float(np.sqrt(max(least, 0.0)))

@@ -17,6 +17,8 @@ Pose = NDArray[np.float64]
 
 CONTRAST_SIGMA_SHARE = 1.0 / 40.0
 """Width of the window of local contrast normalisation, as a share of the image width."""
+CLOUD_FRAMES = 3
+"""So many images make the cloud of the coarse methods on points: their time grows with it."""
 CONTRAST_FLOOR = 0.02
 """Local standard deviation (intensity 0 to 1) below which texture is taken for noise."""
 
@@ -81,7 +83,7 @@ def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
     owners = [np.full(len(points), index) for index, (points, _) in enumerate(keypoints)]
     return PreparedView(
         frames=frames,
-        points=_thinned_cloud(frames, config),
+        points=_thinned_cloud(frames[:CLOUD_FRAMES], config),
         keypoints=np.concatenate([points for points, _ in keypoints]),
         keypoint_frames=np.concatenate(owners).astype(np.int64),
         keypoint_descriptors=np.concatenate([descriptors for _, descriptors in keypoints]),
