@@ -19,7 +19,7 @@ the gradient is dS/dx = E' [dS/dmu_x] + 2 x E' [dS/dE xx] + y E' [dS/dE xy], wit
 window is symmetric. So one pass writes three maps and the next one windows them: each first down
 the columns (lanes are neighbouring columns), then along the row in a buffer with zero margins.
 
-Every flat image array has room for LANES values past its end, which vectors may read.
+`image` and `target` have room for LANES values past their ends, which vectors may read.
 """
 
 from __future__ import annotations
@@ -29,7 +29,19 @@ import numpy as np
 from magic_core.render.jit import inlined, kernel
 from magic_core.render.lanes import LANES
 from magic_core.render.layout import f32
-from magic_core.render.simd import claim, fma, fnma, load, splat, store
+from magic_core.render.simd import (
+    absolute,
+    claim,
+    fma,
+    fnma,
+    lane_sum,
+    load,
+    read,
+    select,
+    splat,
+    store,
+    zero_unless,
+)
 
 RADIUS = 5
 _C1, _C2 = f32(0.01**2), f32(0.03**2)
@@ -44,6 +56,12 @@ def ssim_window() -> np.ndarray:
     offsets = np.arange(-RADIUS, RADIUS + 1)
     weights = np.exp(-0.5 * (offsets / 1.5) ** 2)
     return (weights / weights.sum()).astype(np.float32)
+
+
+@inlined
+def padded_width(width):
+    """The image's width rounded up to whole vectors."""
+    return (width + LANES - 1) // LANES * LANES
 
 
 @kernel
@@ -74,33 +92,71 @@ def _along_row(line, start, window):
     return total
 
 
+@inlined
+def _fill_line(line, values, begin, width, given):
+    """Copy a row of an image into `line`, or ones if it is not given; its margin stays zero."""
+    for x in range(width):
+        line[x] = values[begin + x] if given else _ONE
+
+
+@inlined
+def _clear_margins(lines, count, stride, width):
+    """Zero what lies past the image's last column in `count` buffers of windowed columns."""
+    for k in range(count):
+        for x in range(RADIUS + width, stride):
+            lines[k * stride + x] = _ZERO
+
+
+@inlined
+def _sign(difference):
+    """-1, 0 or 1 per lane."""
+    one, zero = splat(_ONE), splat(_ZERO)
+    return select(difference > zero, one, zero) - select(difference < zero, one, zero)
+
+
+@inlined
+def _similarity(mu_x, mu_y, e_xx, e_yy, e_xy):
+    """S and its derivatives by mu_x, E xx and E xy."""
+    two = splat(_TWO)
+    product, squares = mu_x * mu_y, fma(mu_x, mu_x, mu_y * mu_y)
+    a1, b1 = fma(two, product, splat(_C1)), squares + splat(_C1)
+    a2 = fma(two, e_xy - product, splat(_C2))
+    b2 = (e_xx + e_yy) - squares + splat(_C2)
+    inverse = splat(_ONE) / (b1 * b2)
+    similarity = a1 * a2 * inverse
+    by_xy = two * a1 * inverse
+    by_xx = splat(_ZERO) - similarity * b1 * inverse
+    by_mu = fnma(two * mu_x, similarity * b2 * inverse, two * mu_y * a2 * inverse)
+    by_mu = fnma(mu_y, by_xy, fnma(two * mu_x, by_xx, by_mu))
+    return similarity, by_mu, by_xx, by_xy
+
+
 @kernel
 def ssim_maps(claimed, image, target, width, height, weight, has_weight, window,
               share, maps, row_sums):  # fmt: skip
-    """maps (3 channels x 3 maps, h, w): share W (dS/dmu_x, dS/dE xx, dS/dE xy); sums of W S.
+    """maps (3 channels x 3 maps, h, padded): share W (dS/dmu_x, dS/dE xx, dS/dE xy); sums of W S.
 
-    share is the loss's derivative by one pixel's S.
+    share is the loss's derivative by one pixel's S; padded is `padded_width(width)`.
     """
-    plane = width * height
-    padded = (width + LANES - 1) // LANES * LANES
+    plane, padded = width * height, padded_width(width)
     stride = padded + 2 * RADIUS + LANES
     lines = np.zeros(5 * stride, np.float32)
-    out = np.zeros(4 * padded, np.float32)
+    weights = np.zeros(padded, np.float32)
     while True:
         row = claim(claimed, np.int64(1))
         if row >= height:
             break
         first, last = max(row - RADIUS, 0), min(row + RADIUS, height - 1)
-        total = 0.0
+        _fill_line(weights, weight, row * width, width, has_weight)
+        total = splat(_ZERO)
         for channel in range(3):
-            base = channel * plane
             for x in range(0, padded, LANES):
                 m_x, m_y = splat(_ZERO), splat(_ZERO)
                 m_xx, m_yy, m_xy = splat(_ZERO), splat(_ZERO), splat(_ZERO)
                 for r in range(first, last + 1):
-                    w = splat(window[r - row + RADIUS])
-                    a = load(image, base + r * width + x)
-                    b = load(target, base + r * width + x)
+                    w = splat(read(window, r - row + RADIUS))
+                    a = load(image, channel * plane + r * width + x)
+                    b = load(target, channel * plane + r * width + x)
                     wa, wb = w * a, w * b
                     m_x, m_y = m_x + wa, m_y + wb
                     m_xx, m_yy, m_xy = fma(wa, a, m_xx), fma(wb, b, m_yy), fma(wa, b, m_xy)
@@ -110,37 +166,22 @@ def ssim_maps(claimed, image, target, width, height, weight, has_weight, window,
                 store(lines, 2 * stride + to, m_xx)
                 store(lines, 3 * stride + to, m_yy)
                 store(lines, 4 * stride + to, m_xy)
-            for k in range(5):
-                for x in range(RADIUS + width, stride):
-                    lines[k * stride + x] = _ZERO
+            _clear_margins(lines, 5, stride, width)
             for x in range(0, padded, LANES):
-                mu_x, mu_y = _along_row(lines, x, window), _along_row(lines, stride + x, window)
-                e_xx = _along_row(lines, 2 * stride + x, window)
-                e_yy = _along_row(lines, 3 * stride + x, window)
-                e_xy = _along_row(lines, 4 * stride + x, window)
-                two = splat(_TWO)
-                product, squares = mu_x * mu_y, fma(mu_x, mu_x, mu_y * mu_y)
-                a1, b1 = fma(two, product, splat(_C1)), squares + splat(_C1)
-                a2 = fma(two, e_xy - product, splat(_C2))
-                b2 = (e_xx + e_yy) - squares + splat(_C2)
-                inverse = splat(_ONE) / (b1 * b2)
-                similarity = a1 * a2 * inverse
-                by_xy = two * a1 * inverse
-                by_xx = splat(_ZERO) - similarity * b1 * inverse
-                by_mu = fnma(two * mu_x, similarity * b2 * inverse, two * mu_y * a2 * inverse)
-                by_mu = fnma(mu_y, by_xy, fnma(two * mu_x, by_xx, by_mu))
-                store(out, x, by_mu)
-                store(out, padded + x, by_xx)
-                store(out, 2 * padded + x, by_xy)
-                store(out, 3 * padded + x, similarity)
-            begin = row * width
-            for x in range(width):
-                pixel_weight = weight[begin + x] if has_weight else _ONE
-                total += np.float64(pixel_weight * out[3 * padded + x])
-                for k in range(3):
-                    to = (3 * channel + k) * plane + begin + x
-                    maps[to] = share * pixel_weight * out[k * padded + x]
-        row_sums[row, 1] = total
+                similarity, by_mu, by_xx, by_xy = _similarity(
+                    _along_row(lines, x, window), _along_row(lines, stride + x, window),
+                    _along_row(lines, 2 * stride + x, window),
+                    _along_row(lines, 3 * stride + x, window),
+                    _along_row(lines, 4 * stride + x, window),
+                )  # fmt: skip
+                w = load(weights, x)  # 0 past the last column
+                total = fma(w, similarity, total)
+                w = w * splat(share)
+                to = (3 * channel * height + row) * padded + x
+                store(maps, to, w * by_mu)
+                store(maps, to + height * padded, w * by_xx)
+                store(maps, to + 2 * height * padded, w * by_xy)
+        row_sums[row, 1] = np.float64(lane_sum(total))
 
 
 @kernel
@@ -150,51 +191,52 @@ def image_gradient(claimed, image, target, width, height, depth, weight, has_wei
 
     l1_share and depth_share are the loss's derivatives by one pixel's |x - y| and |z - a d|.
     """
-    plane = width * height
-    padded = (width + LANES - 1) // LANES * LANES
+    plane, padded = width * height, padded_width(width)
     stride = padded + 2 * RADIUS + LANES
     lines = np.zeros(3 * stride, np.float32)
-    out = np.zeros(padded, np.float32)
+    out, weights = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
+    depths, by_alpha = np.zeros(padded, np.float32), np.zeros(padded, np.float32)
     while True:
         row = claim(claimed, np.int64(1))
         if row >= height:
             break
         first, last = max(row - RADIUS, 0), min(row + RADIUS, height - 1)
         begin = row * width
-        colour_sum, depth_sum = 0.0, 0.0
+        _fill_line(weights, weight, begin, width, has_weight)
+        _fill_line(depths, depth, begin, width, True)
+        total = splat(_ZERO)
         for channel in range(3):
-            for x in range(0, padded, LANES):
-                for k in range(3):
-                    total = splat(_ZERO)
-                    for r in range(first, last + 1):
-                        at = (3 * channel + k) * plane + r * width + x
-                        total = fma(load(maps, at), splat(window[r - row + RADIUS]), total)
-                    store(lines, k * stride + RADIUS + x, total)
             for k in range(3):
-                for x in range(RADIUS + width, stride):
-                    lines[k * stride + x] = _ZERO
+                top = (3 * channel + k) * height * padded
+                for x in range(0, padded, LANES):
+                    windowed = splat(_ZERO)
+                    for r in range(first, last + 1):
+                        w = splat(read(window, r - row + RADIUS))
+                        windowed = fma(load(maps, top + r * padded + x), w, windowed)
+                    store(lines, k * stride + RADIUS + x, windowed)
             base = channel * plane + begin
             for x in range(0, padded, LANES):
                 by_mu = _along_row(lines, x, window)
                 by_xx = _along_row(lines, stride + x, window)
                 by_xy = _along_row(lines, 2 * stride + x, window)
-                total = fma(splat(_TWO) * load(image, base + x), by_xx, by_mu)
-                store(out, x, fma(load(target, base + x), by_xy, total))
+                a, b, w = load(image, base + x), load(target, base + x), load(weights, x)
+                slope = fma(b, by_xy, fma(splat(_TWO) * a, by_xx, by_mu))
+                total = fma(w, absolute(a - b), total)
+                store(out, x, fma(w * splat(l1_share), _sign(a - b), slope))
             for x in range(width):
-                pixel_weight = weight[begin + x] if has_weight else _ONE
-                difference = image[base + x] - target[base + x]
-                sign = f32(difference > _ZERO) - f32(difference < _ZERO)
-                gradient[base + x] = out[x] + l1_share * pixel_weight * sign
-                colour_sum += np.float64(pixel_weight * abs(difference))
+                gradient[base + x] = out[x]
+        row_sums[row, 0] = np.float64(lane_sum(total))
+        total = splat(_ZERO)
+        for x in range(0, padded, LANES):
+            d = load(depths, x)
+            w = zero_unless(d > splat(_ZERO), load(weights, x))
+            z, alpha = load(image, 3 * plane + begin + x), load(image, 4 * plane + begin + x)
+            difference = fnma(alpha, d, z)
+            total = fma(w, absolute(difference), total)
+            by_depth = w * splat(depth_share) * _sign(difference)
+            store(out, x, by_depth)
+            store(by_alpha, x, splat(_ZERO) - by_depth * d)
         for x in range(width):
-            i = begin + x
-            pixel_weight = weight[i] if has_weight else _ONE
-            if not depth[i] > _ZERO:
-                pixel_weight = _ZERO
-            difference = image[3 * plane + i] - image[4 * plane + i] * depth[i]
-            sign = f32(difference > _ZERO) - f32(difference < _ZERO)
-            gradient[3 * plane + i] = depth_share * pixel_weight * sign
-            gradient[4 * plane + i] = -depth_share * pixel_weight * sign * depth[i]
-            depth_sum += np.float64(pixel_weight * abs(difference))
-        row_sums[row, 0] = colour_sum
-        row_sums[row, 2] = depth_sum
+            gradient[3 * plane + begin + x] = out[x]
+            gradient[4 * plane + begin + x] = by_alpha[x]
+        row_sums[row, 2] = np.float64(lane_sum(total))

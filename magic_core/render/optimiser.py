@@ -78,8 +78,8 @@ class _Targets:
         height, width = self.shape
         pixels = height * width
         self.colour = aligned_zeros(3 * pixels + LANES)
-        self.maps = aligned_zeros(9 * pixels + LANES)
-        self.gradient = aligned_zeros(5 * pixels + LANES)
+        self.maps = aligned_zeros(9 * height * losses.padded_width.py_func(width))
+        self.gradient = aligned_zeros(5 * pixels)
         self.row_sums = np.zeros((height, losses.ROW_SUMS))
         self.valid = np.zeros(height, np.int64)
 
