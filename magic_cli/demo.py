@@ -14,7 +14,7 @@ from tyro.conf import Suppress
 
 from magic_cli.options import parse
 from magic_cli.output import console, print_json
-from magic_cli.run import RunConfig, run
+from magic_cli.run import RunConfig, default_out, run
 from magic_core.config import field_names
 from magic_core.data.synthetic import SyntheticConfig
 from magic_server.globalmap import MergeConfig
@@ -43,7 +43,8 @@ def main(arguments: list[str]) -> int:
     if config.only_data:
         return 0
     settings = {name: getattr(config, name) for name in field_names(RunConfig)}
-    metrics = run(RunConfig(**{**settings, "dataset": str(config.data)}))
+    settings |= {"dataset": str(config.data), "out": config.out or default_out("demo")}
+    metrics = run(RunConfig(**settings))
     if config.json:
         print_json(metrics)
     return 0

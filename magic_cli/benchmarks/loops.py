@@ -29,7 +29,7 @@ class LoopsBenchmark:
     """Every n-th frame of an agent is an anchor."""
     scale: float = 0.5
     """Process images at this fraction of their size."""
-    methods: tuple[str, ...] = ("visual+kiss", "kiss", "fpfh")
+    methods: tuple[str, ...] = ("visual", "visual+kiss", "kiss", "fpfh")
     """Coarse registration methods, `+` joins those that are tried together."""
     models: tuple[str, ...] = ("efficientnet_lite0",)
     """Image encoders: names, or paths of ONNX files."""
