@@ -22,7 +22,7 @@ from tyro.conf import Positional
 
 from magic_agent.config import AgentConfig
 from magic_cli.options import parse
-from magic_cli.output import print_json
+from magic_cli.output import console, print_json
 from magic_core.config import field_names, save_yaml
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.globalmap import MergeConfig
@@ -30,6 +30,9 @@ from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.posegraph import PoseGraphConfig
 from magic_server.registration import RegistrationConfig
+
+WORTH_SAYING_S = 5.0
+"""Loading compiled kernels takes less; compiling them takes more, and is said."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,12 +92,24 @@ def run(config: RunConfig) -> dict:
     )
     folder = RunFolder(config.out or default_out(config.dataset)).create()
     save_yaml(config, folder.config_path)
+    compile_kernels()
     outcome = asyncio.run(LocalRun(config, sources, folder).run())
     from magic_cli.evaluation import measure
 
     metrics = measure(folder, sources, outcome=outcome, report=config.report, started=start)
     print_summary(metrics, folder)
     return metrics
+
+
+def compile_kernels() -> None:
+    """Compile the kernels once, here, so that no agent's first frame waits for it unannounced."""
+    from magic_core.render import warm_up
+
+    with console.status("compiling or loading the kernels for this processor") as status:
+        report = warm_up(progress=status.update)
+    if report.total_s > WORTH_SAYING_S:
+        where = report.cache_folder or "memory: no cache folder can be written"
+        console.print(f"Kernels compiled in {report.total_s:.0f} s, kept in {where}")
 
 
 def default_out(dataset: str) -> Path:
