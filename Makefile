@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 .PHONY: help setup demo test test-all check proto clean
 
 help:
-	@echo "make demo      install, then map a generated flat with three agents and open-ready report"
+	@echo "make demo      install, then map a generated flat with three agents and write a report"
 	@echo "make test      install, then run the tests (under 10 minutes on 2 cores)"
 	@echo "make test-all  the tests, the slow ones included"
 	@echo "make setup     only install into .venv"

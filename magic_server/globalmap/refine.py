@@ -2,7 +2,7 @@
 
 Paper, "Global Map Construction": the mapping losses again, over all sub-maps' keyframes, and
 pruning. The paper takes 3,000 steps on keyframes at random; here keyframes take turns by the space
-they see, duplicates of overlapping sub-maps go half way, and it ends once the loss settles.
+they see, duplicates of overlapping sub-maps go half way, and it can end once the loss settles.
 """
 
 from __future__ import annotations
