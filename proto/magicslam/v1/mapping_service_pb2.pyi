@@ -802,7 +802,7 @@ class LocalizeRequest(_message.Message):
     session: _builtins.str
     """Resource name `sessions/{session}`."""
     colour: _builtins.bytes
-    """The colour image, encoded."""
+    """The colour image, encoded. Colour and depth together must fit one message (4 MiB)."""
     colour_media_type: _builtins.str
     """image/jpeg or image/png."""
     depth_png: _builtins.bytes
@@ -850,6 +850,10 @@ class LocalizeResponse(_message.Message):
     FITNESS_FIELD_NUMBER: _builtins.int
     RMSE_M_FIELD_NUMBER: _builtins.int
     INLIERS_FIELD_NUMBER: _builtins.int
+    OVERLAP_FIELD_NUMBER: _builtins.int
+    SIMILARITY_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
+    INFORMATION_FIELD_NUMBER: _builtins.int
     component: _builtins.str
     """The component whose world frame the pose is in."""
     revision: _builtins.int
@@ -862,6 +866,14 @@ class LocalizeResponse(_message.Message):
     """Root mean square distance of the counterparts, metres."""
     inliers: _builtins.int
     """Correspondences that support the alignment."""
+    overlap: _builtins.float
+    """Share of the image that the sub-map's images confirm, 0 to 1."""
+    similarity: _builtins.float
+    """Cosine similarity of the descriptors, -1 to 1."""
+    confidence: _builtins.float
+    """Agreement of image and map where they overlap, 0 to 1: fitness, times the correlation of texture,
+    times the share of readings that do not stand in space the map has seen through.
+    """
     @_builtins.property
     def world_from_camera(self) -> _geometry_pb2.Pose:
         """Maps points of the camera to the component's world, metres."""
@@ -869,6 +881,12 @@ class LocalizeResponse(_message.Message):
     @_builtins.property
     def anchor_from_camera(self) -> _geometry_pb2.Pose:
         """Maps points of the camera to that sub-map's anchor, metres; stays right when the graph moves."""
+
+    @_builtins.property
+    def information(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Upper triangle of the 6x6 information matrix of `anchor_from_camera`, row by row (21 numbers; as in
+        OdometryEdge). Its inverse is the covariance of the alignment, the map's own error left out.
+        """
 
     def __init__(
         self,
@@ -881,10 +899,14 @@ class LocalizeResponse(_message.Message):
         fitness: _builtins.float = ...,
         rmse_m: _builtins.float = ...,
         inliers: _builtins.int = ...,
+        overlap: _builtins.float = ...,
+        similarity: _builtins.float = ...,
+        confidence: _builtins.float = ...,
+        information: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera", "world_from_camera", b"world_from_camera"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera", "component", b"component", "fitness", b"fitness", "inliers", b"inliers", "revision", b"revision", "rmse_m", b"rmse_m", "submap", b"submap", "world_from_camera", b"world_from_camera"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera", "component", b"component", "confidence", b"confidence", "fitness", b"fitness", "information", b"information", "inliers", b"inliers", "overlap", b"overlap", "revision", b"revision", "rmse_m", b"rmse_m", "similarity", b"similarity", "submap", b"submap", "world_from_camera", b"world_from_camera"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -150,7 +150,9 @@ class MappingServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def Localize(self, request, context):
-        """Finds the pose of an RGB-D image in the stored map. Not offered yet: answers UNIMPLEMENTED.
+        """Finds the pose of an RGB-D image in the stored map: the sub-maps nearest by descriptor are
+        registered to it and verified as loops are. NOT_FOUND, reason NOT_LOCALIZED, when none passes;
+        the message says which were tried and why each was refused. Changes nothing.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -50,7 +50,10 @@ class MappingServiceStub:
     one revision.
     """
     Localize: _aio.UnaryUnaryMultiCallable[_mapping_service_pb2.LocalizeRequest, _mapping_service_pb2.LocalizeResponse]
-    """Finds the pose of an RGB-D image in the stored map. Not offered yet: answers UNIMPLEMENTED."""
+    """Finds the pose of an RGB-D image in the stored map: the sub-maps nearest by descriptor are
+    registered to it and verified as loops are. NOT_FOUND, reason NOT_LOCALIZED, when none passes;
+    the message says which were tried and why each was refused. Changes nothing.
+    """
 
 class MappingServiceServicer(metaclass=_abc_1.ABCMeta):
     """Agents map a place together; the server recognises places and keeps every trajectory consistent."""
@@ -138,6 +141,9 @@ class MappingServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _mapping_service_pb2.LocalizeRequest,
         context: _aio.ServicerContext[_mapping_service_pb2.LocalizeRequest, _abc.Awaitable[_mapping_service_pb2.LocalizeResponse]],
     ) -> _abc.Awaitable[_mapping_service_pb2.LocalizeResponse]:
-        """Finds the pose of an RGB-D image in the stored map. Not offered yet: answers UNIMPLEMENTED."""
+        """Finds the pose of an RGB-D image in the stored map: the sub-maps nearest by descriptor are
+        registered to it and verified as loops are. NOT_FOUND, reason NOT_LOCALIZED, when none passes;
+        the message says which were tried and why each was refused. Changes nothing.
+        """
 
 def add_MappingServiceServicer_to_server(servicer: MappingServiceServicer, server: _aio.Server) -> None: ...

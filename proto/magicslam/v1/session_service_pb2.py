@@ -26,15 +26,15 @@ from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__
 from magicslam.v1 import submap_pb2 as magicslam_dot_v1_dot_submap__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"magicslam/v1/session_service.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x19magicslam/v1/submap.proto\"\xec\x01\n\x07Session\x12\x0c\n\x04name\x18\x01 \x01(\t\x12.\n\ncreated_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x1b\n\x13\x64\x65scriptor_model_id\x18\x03 \x01(\t\x12\x1c\n\x14\x64\x65scriptor_dimension\x18\x04 \x01(\r\x12\x13\n\x0b\x61gent_count\x18\x05 \x01(\r\x12\x14\n\x0csubmap_count\x18\x06 \x01(\r\x12\x14\n\x0cstored_bytes\x18\x07 \x01(\x04\x12\x10\n\x08revision\x18\x08 \x01(\x04\x12\x15\n\rpending_loops\x18\t \x01(\r\"\xd4\x01\n\x05\x41gent\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\'\n\x05state\x18\x02 \x01(\x0e\x32\x18.magicslam.v1.AgentState\x12\x31\n\rregistered_at\x18\x03 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x30\n\x0clast_seen_at\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0csubmap_count\x18\x05 \x01(\r\x12\x19\n\x11next_submap_index\x18\x06 \x01(\r\"\xd7\x01\n\x06Submap\x12\x0c\n\x04name\x18\x01 \x01(\t\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x19\n\x11\x66irst_timestamp_s\x18\x03 \x01(\x01\x12\x18\n\x10last_timestamp_s\x18\x04 \x01(\x01\x12\x13\n\x0b\x66rame_count\x18\x05 \x01(\r\x12\x16\n\x0ekeyframe_count\x18\x06 \x01(\r\x12\x16\n\x0egaussian_count\x18\x07 \x01(\x04\x12\x14\n\x0cstored_bytes\x18\x08 \x01(\x04\"!\n\x11GetSessionRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"<\n\x12GetSessionResponse\x12&\n\x07session\x18\x01 \x01(\x0b\x32\x15.magicslam.v1.Session\"<\n\x13ListSessionsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\r\x12\x12\n\npage_token\x18\x02 \x01(\t\"X\n\x14ListSessionsResponse\x12\'\n\x08sessions\x18\x01 \x03(\x0b\x32\x15.magicslam.v1.Session\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"$\n\x14\x44\x65leteSessionRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"\x17\n\x15\x44\x65leteSessionResponse\"\x1f\n\x0fGetAgentRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"6\n\x10GetAgentResponse\x12\"\n\x05\x61gent\x18\x01 \x01(\x0b\x32\x13.magicslam.v1.Agent\"K\n\x11ListAgentsRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"R\n\x12ListAgentsResponse\x12#\n\x06\x61gents\x18\x01 \x03(\x0b\x32\x13.magicslam.v1.Agent\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\"\n\x12\x44\x65leteAgentRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"\x15\n\x13\x44\x65leteAgentResponse\" \n\x10GetSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"e\n\x11GetSubmapResponse\x12$\n\x06submap\x18\x01 \x01(\x0b\x32\x14.magicslam.v1.Submap\x12*\n\x06header\x18\x02 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeader\"K\n\x12ListSubmapsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"U\n\x13ListSubmapsResponse\x12%\n\x07submaps\x18\x01 \x03(\x0b\x32\x14.magicslam.v1.Submap\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"#\n\x13\x44\x65leteSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"\x16\n\x14\x44\x65leteSubmapResponse\"%\n\x15\x44ownloadSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"{\n\x16\x44ownloadSubmapResponse\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeaderH\x00\x12(\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x17.magicslam.v1.BlobChunkH\x00\x42\t\n\x07payload*[\n\nAgentState\x12\x1b\n\x17\x41GENT_STATE_UNSPECIFIED\x10\x00\x12\x16\n\x12\x41GENT_STATE_ACTIVE\x10\x01\x12\x18\n\x14\x41GENT_STATE_FINISHED\x10\x02\x32\xda\x06\n\x0eSessionService\x12O\n\nGetSession\x12\x1f.magicslam.v1.GetSessionRequest\x1a .magicslam.v1.GetSessionResponse\x12U\n\x0cListSessions\x12!.magicslam.v1.ListSessionsRequest\x1a\".magicslam.v1.ListSessionsResponse\x12X\n\rDeleteSession\x12\".magicslam.v1.DeleteSessionRequest\x1a#.magicslam.v1.DeleteSessionResponse\x12I\n\x08GetAgent\x12\x1d.magicslam.v1.GetAgentRequest\x1a\x1e.magicslam.v1.GetAgentResponse\x12O\n\nListAgents\x12\x1f.magicslam.v1.ListAgentsRequest\x1a .magicslam.v1.ListAgentsResponse\x12R\n\x0b\x44\x65leteAgent\x12 .magicslam.v1.DeleteAgentRequest\x1a!.magicslam.v1.DeleteAgentResponse\x12L\n\tGetSubmap\x12\x1e.magicslam.v1.GetSubmapRequest\x1a\x1f.magicslam.v1.GetSubmapResponse\x12R\n\x0bListSubmaps\x12 .magicslam.v1.ListSubmapsRequest\x1a!.magicslam.v1.ListSubmapsResponse\x12U\n\x0c\x44\x65leteSubmap\x12!.magicslam.v1.DeleteSubmapRequest\x1a\".magicslam.v1.DeleteSubmapResponse\x12]\n\x0e\x44ownloadSubmap\x12#.magicslam.v1.DownloadSubmapRequest\x1a$.magicslam.v1.DownloadSubmapResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"magicslam/v1/session_service.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x19magicslam/v1/submap.proto\"\xec\x01\n\x07Session\x12\x0c\n\x04name\x18\x01 \x01(\t\x12.\n\ncreated_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x1b\n\x13\x64\x65scriptor_model_id\x18\x03 \x01(\t\x12\x1c\n\x14\x64\x65scriptor_dimension\x18\x04 \x01(\r\x12\x13\n\x0b\x61gent_count\x18\x05 \x01(\r\x12\x14\n\x0csubmap_count\x18\x06 \x01(\r\x12\x14\n\x0cstored_bytes\x18\x07 \x01(\x04\x12\x10\n\x08revision\x18\x08 \x01(\x04\x12\x15\n\rpending_loops\x18\t \x01(\r\"\xd4\x01\n\x05\x41gent\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\'\n\x05state\x18\x02 \x01(\x0e\x32\x18.magicslam.v1.AgentState\x12\x31\n\rregistered_at\x18\x03 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x30\n\x0clast_seen_at\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0csubmap_count\x18\x05 \x01(\r\x12\x19\n\x11next_submap_index\x18\x06 \x01(\r\"\xd7\x01\n\x06Submap\x12\x0c\n\x04name\x18\x01 \x01(\t\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x19\n\x11\x66irst_timestamp_s\x18\x03 \x01(\x01\x12\x18\n\x10last_timestamp_s\x18\x04 \x01(\x01\x12\x13\n\x0b\x66rame_count\x18\x05 \x01(\r\x12\x16\n\x0ekeyframe_count\x18\x06 \x01(\r\x12\x16\n\x0egaussian_count\x18\x07 \x01(\x04\x12\x14\n\x0cstored_bytes\x18\x08 \x01(\x04\"!\n\x11GetSessionRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"<\n\x12GetSessionResponse\x12&\n\x07session\x18\x01 \x01(\x0b\x32\x15.magicslam.v1.Session\"<\n\x13ListSessionsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\r\x12\x12\n\npage_token\x18\x02 \x01(\t\"X\n\x14ListSessionsResponse\x12\'\n\x08sessions\x18\x01 \x03(\x0b\x32\x15.magicslam.v1.Session\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"G\n\x14\x44\x65leteSessionRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\r\n\x05\x66orce\x18\x03 \x01(\x08\"B\n\x15\x44\x65leteSessionResponse\x12\x14\n\x0csubmap_count\x18\x01 \x01(\r\x12\x13\n\x0b\x66reed_bytes\x18\x02 \x01(\x04\"\x1f\n\x0fGetAgentRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"6\n\x10GetAgentResponse\x12\"\n\x05\x61gent\x18\x01 \x01(\x0b\x32\x13.magicslam.v1.Agent\"K\n\x11ListAgentsRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"R\n\x12ListAgentsResponse\x12#\n\x06\x61gents\x18\x01 \x03(\x0b\x32\x13.magicslam.v1.Agent\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"E\n\x12\x44\x65leteAgentRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\r\n\x05\x66orce\x18\x03 \x01(\x08\"@\n\x13\x44\x65leteAgentResponse\x12\x14\n\x0csubmap_count\x18\x01 \x01(\r\x12\x13\n\x0b\x66reed_bytes\x18\x02 \x01(\x04\" \n\x10GetSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"e\n\x11GetSubmapResponse\x12$\n\x06submap\x18\x01 \x01(\x0b\x32\x14.magicslam.v1.Submap\x12*\n\x06header\x18\x02 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeader\"K\n\x12ListSubmapsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"U\n\x13ListSubmapsResponse\x12%\n\x07submaps\x18\x01 \x03(\x0b\x32\x14.magicslam.v1.Submap\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"F\n\x13\x44\x65leteSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\r\n\x05\x66orce\x18\x03 \x01(\x08\"A\n\x14\x44\x65leteSubmapResponse\x12\x14\n\x0csubmap_count\x18\x01 \x01(\r\x12\x13\n\x0b\x66reed_bytes\x18\x02 \x01(\x04\"%\n\x15\x44ownloadSubmapRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"{\n\x16\x44ownloadSubmapResponse\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeaderH\x00\x12(\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x17.magicslam.v1.BlobChunkH\x00\x42\t\n\x07payload*[\n\nAgentState\x12\x1b\n\x17\x41GENT_STATE_UNSPECIFIED\x10\x00\x12\x16\n\x12\x41GENT_STATE_ACTIVE\x10\x01\x12\x18\n\x14\x41GENT_STATE_FINISHED\x10\x02\x32\xda\x06\n\x0eSessionService\x12O\n\nGetSession\x12\x1f.magicslam.v1.GetSessionRequest\x1a .magicslam.v1.GetSessionResponse\x12U\n\x0cListSessions\x12!.magicslam.v1.ListSessionsRequest\x1a\".magicslam.v1.ListSessionsResponse\x12X\n\rDeleteSession\x12\".magicslam.v1.DeleteSessionRequest\x1a#.magicslam.v1.DeleteSessionResponse\x12I\n\x08GetAgent\x12\x1d.magicslam.v1.GetAgentRequest\x1a\x1e.magicslam.v1.GetAgentResponse\x12O\n\nListAgents\x12\x1f.magicslam.v1.ListAgentsRequest\x1a .magicslam.v1.ListAgentsResponse\x12R\n\x0b\x44\x65leteAgent\x12 .magicslam.v1.DeleteAgentRequest\x1a!.magicslam.v1.DeleteAgentResponse\x12L\n\tGetSubmap\x12\x1e.magicslam.v1.GetSubmapRequest\x1a\x1f.magicslam.v1.GetSubmapResponse\x12R\n\x0bListSubmaps\x12 .magicslam.v1.ListSubmapsRequest\x1a!.magicslam.v1.ListSubmapsResponse\x12U\n\x0c\x44\x65leteSubmap\x12!.magicslam.v1.DeleteSubmapRequest\x1a\".magicslam.v1.DeleteSubmapResponse\x12]\n\x0e\x44ownloadSubmap\x12#.magicslam.v1.DownloadSubmapRequest\x1a$.magicslam.v1.DownloadSubmapResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'magicslam.v1.session_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_AGENTSTATE']._serialized_start=1931
-  _globals['_AGENTSTATE']._serialized_end=2022
+  _globals['_AGENTSTATE']._serialized_start=2165
+  _globals['_AGENTSTATE']._serialized_end=2256
   _globals['_SESSION']._serialized_start=113
   _globals['_SESSION']._serialized_end=349
   _globals['_AGENT']._serialized_start=352
@@ -50,37 +50,37 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_LISTSESSIONSRESPONSE']._serialized_start=943
   _globals['_LISTSESSIONSRESPONSE']._serialized_end=1031
   _globals['_DELETESESSIONREQUEST']._serialized_start=1033
-  _globals['_DELETESESSIONREQUEST']._serialized_end=1069
-  _globals['_DELETESESSIONRESPONSE']._serialized_start=1071
-  _globals['_DELETESESSIONRESPONSE']._serialized_end=1094
-  _globals['_GETAGENTREQUEST']._serialized_start=1096
-  _globals['_GETAGENTREQUEST']._serialized_end=1127
-  _globals['_GETAGENTRESPONSE']._serialized_start=1129
-  _globals['_GETAGENTRESPONSE']._serialized_end=1183
-  _globals['_LISTAGENTSREQUEST']._serialized_start=1185
-  _globals['_LISTAGENTSREQUEST']._serialized_end=1260
-  _globals['_LISTAGENTSRESPONSE']._serialized_start=1262
-  _globals['_LISTAGENTSRESPONSE']._serialized_end=1344
-  _globals['_DELETEAGENTREQUEST']._serialized_start=1346
-  _globals['_DELETEAGENTREQUEST']._serialized_end=1380
-  _globals['_DELETEAGENTRESPONSE']._serialized_start=1382
-  _globals['_DELETEAGENTRESPONSE']._serialized_end=1403
-  _globals['_GETSUBMAPREQUEST']._serialized_start=1405
-  _globals['_GETSUBMAPREQUEST']._serialized_end=1437
-  _globals['_GETSUBMAPRESPONSE']._serialized_start=1439
-  _globals['_GETSUBMAPRESPONSE']._serialized_end=1540
-  _globals['_LISTSUBMAPSREQUEST']._serialized_start=1542
-  _globals['_LISTSUBMAPSREQUEST']._serialized_end=1617
-  _globals['_LISTSUBMAPSRESPONSE']._serialized_start=1619
-  _globals['_LISTSUBMAPSRESPONSE']._serialized_end=1704
-  _globals['_DELETESUBMAPREQUEST']._serialized_start=1706
-  _globals['_DELETESUBMAPREQUEST']._serialized_end=1741
-  _globals['_DELETESUBMAPRESPONSE']._serialized_start=1743
-  _globals['_DELETESUBMAPRESPONSE']._serialized_end=1765
-  _globals['_DOWNLOADSUBMAPREQUEST']._serialized_start=1767
-  _globals['_DOWNLOADSUBMAPREQUEST']._serialized_end=1804
-  _globals['_DOWNLOADSUBMAPRESPONSE']._serialized_start=1806
-  _globals['_DOWNLOADSUBMAPRESPONSE']._serialized_end=1929
-  _globals['_SESSIONSERVICE']._serialized_start=2025
-  _globals['_SESSIONSERVICE']._serialized_end=2883
+  _globals['_DELETESESSIONREQUEST']._serialized_end=1104
+  _globals['_DELETESESSIONRESPONSE']._serialized_start=1106
+  _globals['_DELETESESSIONRESPONSE']._serialized_end=1172
+  _globals['_GETAGENTREQUEST']._serialized_start=1174
+  _globals['_GETAGENTREQUEST']._serialized_end=1205
+  _globals['_GETAGENTRESPONSE']._serialized_start=1207
+  _globals['_GETAGENTRESPONSE']._serialized_end=1261
+  _globals['_LISTAGENTSREQUEST']._serialized_start=1263
+  _globals['_LISTAGENTSREQUEST']._serialized_end=1338
+  _globals['_LISTAGENTSRESPONSE']._serialized_start=1340
+  _globals['_LISTAGENTSRESPONSE']._serialized_end=1422
+  _globals['_DELETEAGENTREQUEST']._serialized_start=1424
+  _globals['_DELETEAGENTREQUEST']._serialized_end=1493
+  _globals['_DELETEAGENTRESPONSE']._serialized_start=1495
+  _globals['_DELETEAGENTRESPONSE']._serialized_end=1559
+  _globals['_GETSUBMAPREQUEST']._serialized_start=1561
+  _globals['_GETSUBMAPREQUEST']._serialized_end=1593
+  _globals['_GETSUBMAPRESPONSE']._serialized_start=1595
+  _globals['_GETSUBMAPRESPONSE']._serialized_end=1696
+  _globals['_LISTSUBMAPSREQUEST']._serialized_start=1698
+  _globals['_LISTSUBMAPSREQUEST']._serialized_end=1773
+  _globals['_LISTSUBMAPSRESPONSE']._serialized_start=1775
+  _globals['_LISTSUBMAPSRESPONSE']._serialized_end=1860
+  _globals['_DELETESUBMAPREQUEST']._serialized_start=1862
+  _globals['_DELETESUBMAPREQUEST']._serialized_end=1932
+  _globals['_DELETESUBMAPRESPONSE']._serialized_start=1934
+  _globals['_DELETESUBMAPRESPONSE']._serialized_end=1999
+  _globals['_DOWNLOADSUBMAPREQUEST']._serialized_start=2001
+  _globals['_DOWNLOADSUBMAPREQUEST']._serialized_end=2038
+  _globals['_DOWNLOADSUBMAPRESPONSE']._serialized_start=2040
+  _globals['_DOWNLOADSUBMAPRESPONSE']._serialized_end=2163
+  _globals['_SESSIONSERVICE']._serialized_start=2259
+  _globals['_SESSIONSERVICE']._serialized_end=3117
 # @@protoc_insertion_point(module_scope)

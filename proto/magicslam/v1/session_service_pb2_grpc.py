@@ -106,7 +106,9 @@ class SessionServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def DeleteSession(self, request, context):
-        """Deletes a session with all it holds. Not offered yet: answers UNIMPLEMENTED.
+        """Deletes a session with all it holds: agents, sub-maps, loops, corrected poses, maps, operations.
+        Refused with FAILED_PRECONDITION while one of its agents may still submit, unless `force` is set.
+        Idempotent by `request_id`.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -127,7 +129,9 @@ class SessionServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def DeleteAgent(self, request, context):
-        """Deletes an agent with its sub-maps. Not offered yet: answers UNIMPLEMENTED.
+        """Deletes an agent with its sub-maps, as DeleteSubmap does. Its name is then free again. Refused
+        with FAILED_PRECONDITION while the agent may still submit, unless `force` is set. Idempotent by
+        `request_id`.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -148,7 +152,11 @@ class SessionServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def DeleteSubmap(self, request, context):
-        """Deletes a sub-map. Not offered yet: answers UNIMPLEMENTED.
+        """Deletes a sub-map with its loops and every map that was merged from it; the pose graph is solved
+        again. The odometry of its neighbours is kept: the sub-map behind it is joined to the one before
+        it by the two edges one after the other. Its index is not used again. Refused with
+        FAILED_PRECONDITION while its agent may still submit, unless `force` is set. Idempotent by
+        `request_id`.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

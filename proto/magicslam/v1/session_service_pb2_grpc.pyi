@@ -21,19 +21,30 @@ class SessionServiceStub:
     ListSessions: _aio.UnaryUnaryMultiCallable[_session_service_pb2.ListSessionsRequest, _session_service_pb2.ListSessionsResponse]
     """Lists sessions, oldest first."""
     DeleteSession: _aio.UnaryUnaryMultiCallable[_session_service_pb2.DeleteSessionRequest, _session_service_pb2.DeleteSessionResponse]
-    """Deletes a session with all it holds. Not offered yet: answers UNIMPLEMENTED."""
+    """Deletes a session with all it holds: agents, sub-maps, loops, corrected poses, maps, operations.
+    Refused with FAILED_PRECONDITION while one of its agents may still submit, unless `force` is set.
+    Idempotent by `request_id`.
+    """
     GetAgent: _aio.UnaryUnaryMultiCallable[_session_service_pb2.GetAgentRequest, _session_service_pb2.GetAgentResponse]
     """Reads an agent."""
     ListAgents: _aio.UnaryUnaryMultiCallable[_session_service_pb2.ListAgentsRequest, _session_service_pb2.ListAgentsResponse]
     """Lists the agents of a session, oldest first."""
     DeleteAgent: _aio.UnaryUnaryMultiCallable[_session_service_pb2.DeleteAgentRequest, _session_service_pb2.DeleteAgentResponse]
-    """Deletes an agent with its sub-maps. Not offered yet: answers UNIMPLEMENTED."""
+    """Deletes an agent with its sub-maps, as DeleteSubmap does. Its name is then free again. Refused
+    with FAILED_PRECONDITION while the agent may still submit, unless `force` is set. Idempotent by
+    `request_id`.
+    """
     GetSubmap: _aio.UnaryUnaryMultiCallable[_session_service_pb2.GetSubmapRequest, _session_service_pb2.GetSubmapResponse]
     """Reads a sub-map's summary and its header as submitted."""
     ListSubmaps: _aio.UnaryUnaryMultiCallable[_session_service_pb2.ListSubmapsRequest, _session_service_pb2.ListSubmapsResponse]
     """Lists sub-maps of a session or of an agent in order of arrival."""
     DeleteSubmap: _aio.UnaryUnaryMultiCallable[_session_service_pb2.DeleteSubmapRequest, _session_service_pb2.DeleteSubmapResponse]
-    """Deletes a sub-map. Not offered yet: answers UNIMPLEMENTED."""
+    """Deletes a sub-map with its loops and every map that was merged from it; the pose graph is solved
+    again. The odometry of its neighbours is kept: the sub-map behind it is joined to the one before
+    it by the two edges one after the other. Its index is not used again. Refused with
+    FAILED_PRECONDITION while its agent may still submit, unless `force` is set. Idempotent by
+    `request_id`.
+    """
     DownloadSubmap: _aio.UnaryStreamMultiCallable[_session_service_pb2.DownloadSubmapRequest, _session_service_pb2.DownloadSubmapResponse]
     """Streams a stored sub-map back, header and blobs, byte for byte as submitted."""
 
@@ -62,7 +73,10 @@ class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _session_service_pb2.DeleteSessionRequest,
         context: _aio.ServicerContext[_session_service_pb2.DeleteSessionRequest, _abc.Awaitable[_session_service_pb2.DeleteSessionResponse]],
     ) -> _abc.Awaitable[_session_service_pb2.DeleteSessionResponse]:
-        """Deletes a session with all it holds. Not offered yet: answers UNIMPLEMENTED."""
+        """Deletes a session with all it holds: agents, sub-maps, loops, corrected poses, maps, operations.
+        Refused with FAILED_PRECONDITION while one of its agents may still submit, unless `force` is set.
+        Idempotent by `request_id`.
+        """
 
     @_abc_1.abstractmethod
     def GetAgent(
@@ -86,7 +100,10 @@ class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _session_service_pb2.DeleteAgentRequest,
         context: _aio.ServicerContext[_session_service_pb2.DeleteAgentRequest, _abc.Awaitable[_session_service_pb2.DeleteAgentResponse]],
     ) -> _abc.Awaitable[_session_service_pb2.DeleteAgentResponse]:
-        """Deletes an agent with its sub-maps. Not offered yet: answers UNIMPLEMENTED."""
+        """Deletes an agent with its sub-maps, as DeleteSubmap does. Its name is then free again. Refused
+        with FAILED_PRECONDITION while the agent may still submit, unless `force` is set. Idempotent by
+        `request_id`.
+        """
 
     @_abc_1.abstractmethod
     def GetSubmap(
@@ -110,7 +127,12 @@ class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _session_service_pb2.DeleteSubmapRequest,
         context: _aio.ServicerContext[_session_service_pb2.DeleteSubmapRequest, _abc.Awaitable[_session_service_pb2.DeleteSubmapResponse]],
     ) -> _abc.Awaitable[_session_service_pb2.DeleteSubmapResponse]:
-        """Deletes a sub-map. Not offered yet: answers UNIMPLEMENTED."""
+        """Deletes a sub-map with its loops and every map that was merged from it; the pose graph is solved
+        again. The odometry of its neighbours is kept: the sub-map behind it is joined to the one before
+        it by the two edges one after the other. Its index is not used again. Refused with
+        FAILED_PRECONDITION while its agent may still submit, unless `force` is set. Idempotent by
+        `request_id`.
+        """
 
     @_abc_1.abstractmethod
     def DownloadSubmap(
