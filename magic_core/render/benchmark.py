@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,13 @@ from magic_core.render.optimiser import GaussianOptimiser
 from magic_core.render.peak import multiply_add_rate
 from magic_core.render.rasteriser import Rasteriser
 
+_Figures = TypeVar("_Figures")
 Cell = tuple[int, int, int]
 CELLS: tuple[Cell, ...] = (
     (320, 240, 20_000), (320, 240, 60_000), (640, 480, 60_000), (640, 480, 150_000),
 )  # fmt: skip
 _WARM_UPS = 2
+_PAUSE_S = 0.01
 
 # Vector instructions of the inner loops per (Gaussian, block), counted in the compiled code.
 _FORWARD_INSTRUCTIONS, _BACKWARD_INSTRUCTIONS = 22, 40
@@ -128,8 +130,8 @@ def _measure_cell(cell: Cell, threads: int, prototype: Any | None, repeats: int)
     other = _prototype_runner(prototype, subject, threads) if prototype is not None else None
     ours, theirs = [], []
     for _ in range(_WARM_UPS + repeats):
-        ours.append(subject.run())
-        theirs.append(other() if other is not None else None)
+        ours.append(_settled(subject.run))
+        theirs.append(_settled(other) if other is not None else None)
     ours, theirs = ours[_WARM_UPS:], theirs[_WARM_UPS:]
     row: dict[str, Any] = {
         "size": f"{cell[0]}x{cell[1]}", "gaussians": cell[2], "threads": threads,
@@ -141,6 +143,17 @@ def _measure_cell(cell: Cell, threads: int, prototype: Any | None, repeats: int)
         row["against_forward_backward_ms"] = median(theirs)
         row["ratio"] = median(a[1] / b for a, b in zip(ours, theirs, strict=True))
     return row
+
+
+def _settled(run: Callable[[], _Figures]) -> _Figures:
+    """A run's figures after a pause and one more run of its own.
+
+    The prototype's OpenMP threads keep a core busy for milliseconds after their work is done, and
+    each leaves the caches full of its own data: neither may be charged to the other.
+    """
+    time.sleep(_PAUSE_S)
+    run()
+    return run()
 
 
 def _load_prototype(folder: Path) -> Any:
