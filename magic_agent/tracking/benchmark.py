@@ -1,45 +1,29 @@
 """`magic bench track`: trackers compared on the same frames, with the same mapper and seed.
 
-Every solver runs the whole local SLAM of every agent without loop closure. What differs is the
-tracking configuration alone. Accuracy is the ATE of each agent on its own; time is that of
-tracking, frame by frame and stage by stage.
+Every variant runs the whole local SLAM of every agent without loop closure. What differs is the
+tracking configuration alone. All variants take each frame in turn before the next one is read, so
+that whatever else the machine does falls on all of them alike. Accuracy is the ATE of each agent
+on its own; time is that of tracking, frame by frame and stage by stage.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.slam_config import SlamConfig
+from magic_agent.tracking.benchmark_report import summary
 from magic_agent.tracking.config import TrackingConfig
+from magic_agent.tracking.trial import AgentRun, Trial
 from magic_core.data import FrameSource, open_dataset
 from magic_core.errors import ConfigError
-from magic_core.evaluation.ate import ate_rmse
-from magic_core.evaluation.trajectory import Trajectory
-from magic_core.submap import Descriptor, Submap
 
 Progress = Callable[[str], None]
 
 SOLVERS = ("gn", "adam")
-
-
-@dataclass(slots=True)
-class AgentRun:
-    """What one tracker did on one agent's frames."""
-
-    ate_rmse_m: float
-    lost_frames: int
-    breaks: int
-    """Sub-maps that began without odometry; each part is aligned on its own for the ATE."""
-    frames_ms: list[float]
-    stages_ms: dict[str, list[float]]
-    mapping_ms: float
-    """Mean mapping time per frame."""
 
 
 def run(
@@ -65,16 +49,13 @@ def run(
     medians = {name: report[name]["ms_per_frame"]["median"] for name in report}
     both = {"gn", "adam"} <= medians.keys()
     return {
-        "dataset": str(dataset),
-        "scale": scale,
-        "stride": stride,
-        "seeds": list(seeds),
+        **_conditions(dataset, scale=scale, frames=frames, stride=stride, seeds=seeds),
         "solvers": report,
         "speedup": medians["adam"] / medians["gn"] if both else None,
     }
 
 
-def run_ablation(
+def run_ablations(
     dataset: Path | str,
     *,
     scale: float = 0.5,
@@ -89,7 +70,9 @@ def run_ablation(
     config = config or SlamConfig()
     variants = ablations(config.tracking)
     if not adam:
-        del variants["adam"]
+        variants = {
+            name: tracking for name, tracking in variants.items() if tracking.solver != "adam"
+        }
     report = compare(
         dataset,
         {name: replace(config, tracking=tracking) for name, tracking in variants.items()},
@@ -99,22 +82,38 @@ def run_ablation(
         seeds=seeds,
         progress=progress,
     )
-    return {"dataset": str(dataset), "scale": scale, "stride": stride, "variants": report}
+    return {
+        **_conditions(dataset, scale=scale, frames=frames, stride=stride, seeds=seeds),
+        "variants": report,
+    }
 
 
 def ablations(tracking: TrackingConfig) -> dict[str, TrackingConfig]:
-    """The variants of `run_ablation` by name."""
+    """The variants of `run_ablations` by name."""
     newton = tracking.gauss_newton
-    variants = {"default": tracking}
+    variants = {
+        "default": tracking,
+        "without pose initialisation": replace(
+            tracking, initialisation="constant_velocity", rotation_prealignment=False
+        ),
+    }
     for name in ("constant_velocity", "dense", "rgbd_odometry", "point_to_plane", "coloured_icp"):
         variants[f"initialisation={name}"] = replace(tracking, initialisation=name)
     for levels in (1, 2, 3, 4):
         fewer = replace(newton, levels=levels)
         variants[f"levels={levels}"] = replace(tracking, gauss_newton=fewer)
-    no_window = replace(tracking.window, images=0)
-    variants["sub-map alone"] = replace(tracking, window=no_window)
+    alone = replace(tracking, window=replace(tracking.window, images=0))
+    variants["sub-map alone"] = alone
+    # Earlier images hide what the refinement starts from: without them it shows.
+    variants["sub-map alone, without pose initialisation"] = replace(
+        alone, initialisation="constant_velocity", rotation_prealignment=False
+    )
     variants["one render"] = replace(tracking, gauss_newton=replace(newton, renders=1))
-    variants["adam"] = replace(tracking, solver="adam", initialisation="coloured_icp")
+    papers = replace(tracking, solver="adam", initialisation="coloured_icp")
+    variants["adam"] = papers
+    variants["adam, without pose initialisation"] = replace(
+        papers, initialisation="constant_velocity", rotation_prealignment=False
+    )
     return variants
 
 
@@ -129,124 +128,42 @@ def compare(
     progress: Progress | None = None,
 ) -> dict[str, dict]:
     """Each variant's report on the same frames."""
-    report = {}
-    for name, config in variants.items():
-        runs: dict[str, list[AgentRun]] = {}
-        for seed in seeds:
-            for source in open_dataset(dataset, scale=scale, max_frames=frames, stride=stride):
-                agent_run = run_agent(source, replace(config, seed=seed))
-                runs.setdefault(source.name, []).append(agent_run)
+    runs: dict[str, list[dict[str, AgentRun]]] = {name: [] for name in variants}
+    for seed in seeds:
+        seeded = {name: replace(config, seed=seed) for name, config in variants.items()}
+        for name in variants:
+            runs[name].append({})
+        for source in open_dataset(dataset, scale=scale, max_frames=frames, stride=stride):
+            for name, found in run_agent(source, seeded).items():
+                runs[name][-1][source.name] = found
                 if progress is not None:
-                    progress(_line(name, source.name, seed, agent_run))
-        report[name] = _summary(runs)
-    return report
+                    progress(_line(name, source.name, seed, found))
+    return {name: summary(by_seed) for name, by_seed in runs.items()}
 
 
-def run_agent(source: FrameSource, config: SlamConfig) -> AgentRun:
-    """Local SLAM over one source; its frames must have ground truth."""
-    slam = LocalSlam(
-        source.camera, config, session="bench", agent=source.name, describe=_no_descriptor
-    )
-    timing, chain = _Timing(), _Chain()
-    mapping_ms, lost, truth = 0.0, 0, []
+def run_agent(source: FrameSource, variants: dict[str, SlamConfig]) -> dict[str, AgentRun]:
+    """Local SLAM of every variant over one source, side by side; it must have ground truth."""
+    trials = {name: Trial(source.name, source.camera, config) for name, config in variants.items()}
     for frame in source:
-        if frame.world_from_camera is None:
-            raise ConfigError.field("dataset", f"{source.name} has no ground truth to compare with")
-        truth.append((frame.timestamp_s, frame.world_from_camera))
-        result = slam.process(frame)
-        mapping_ms += result.mapping_ms
-        lost += result.lost
-        timing.add(result)
-        chain.add(result.finished)
-    chain.add(slam.finish())
-    return AgentRun(
-        ate_rmse_m=chain.ate_rmse_m(Trajectory.from_poses(truth)),
-        lost_frames=lost,
-        breaks=chain.breaks,
-        frames_ms=timing.frames_ms,
-        stages_ms=timing.stages_ms,
-        mapping_ms=mapping_ms / max(len(source), 1),
-    )
+        for trial in trials.values():
+            trial.process(frame)
+    return {name: trial.finish() for name, trial in trials.items()}
 
 
-class _Timing:
-    """Tracking times of one agent."""
-
-    def __init__(self) -> None:
-        self.frames_ms: list[float] = []
-        self.stages_ms: dict[str, list[float]] = {}
-
-    def add(self, result: FrameResult) -> None:
-        """Note one frame; the first of a chain is not tracked."""
-        if result.tracked is None:
-            return
-        self.frames_ms.append(result.tracking_ms)
-        for stage, elapsed_ms in result.tracked.stages_ms.items():
-            self.stages_ms.setdefault(stage, []).append(elapsed_ms)
-
-
-class _Chain:
-    """Finished sub-maps joined by their odometry; a sub-map without odometry begins a new part."""
-
-    def __init__(self) -> None:
-        self._parts: list[list[tuple[float, NDArray[np.float64]]]] = []
-        self._world_from_anchor = np.eye(4)
-
-    @property
-    def breaks(self) -> int:
-        """Parts beyond the first."""
-        return max(len(self._parts) - 1, 0)
-
-    def add(self, submap: Submap | None) -> None:
-        """Append the frames of the next sub-map, if there is one; lost ones are left out."""
-        if submap is None:
-            return
-        if submap.odometry is None:
-            self._parts.append([])
-            self._world_from_anchor = np.eye(4)
-        else:
-            step = submap.odometry.previous_from_anchor
-            self._world_from_anchor = self._world_from_anchor @ step
-        self._parts[-1].extend(
-            (frame.timestamp_s, self._world_from_anchor @ frame.anchor_from_camera)
-            for frame in submap.trajectory
-            if not frame.lost
-        )
-
-    def ate_rmse_m(self, truth: Trajectory) -> float:
-        """RMSE over all parts, each aligned on its own: where one ends, nothing was claimed."""
-        squares, count = 0.0, 0
-        for part in self._parts:
-            if part:
-                squares += len(part) * ate_rmse(Trajectory.from_poses(part), truth)[0] ** 2
-                count += len(part)
-        return float(np.sqrt(squares / max(count, 1)))
-
-
-def _summary(runs: dict[str, list[AgentRun]]) -> dict:
-    """One variant's figures; over seeds the mean, with the lowest and highest beside it."""
-    every = [each for agent_runs in runs.values() for each in agent_runs]
-    by_agent = {
-        agent: [each.ate_rmse_m for each in agent_runs] for agent, agent_runs in runs.items()
-    }
-    means = np.mean(list(by_agent.values()), axis=0)  # per seed, over agents
-    frames_ms = [value for each in every for value in each.frames_ms]
-    stages: dict[str, list[float]] = {}
-    for each in every:
-        for stage, values in each.stages_ms.items():
-            stages.setdefault(stage, []).extend(values)
+def _conditions(
+    dataset: Path | str,
+    *,
+    scale: float,
+    frames: int | None,
+    stride: int,
+    seeds: Sequence[int],
+) -> dict:
     return {
-        "ate_rmse_m": {agent: float(np.mean(values)) for agent, values in by_agent.items()},
-        "mean_ate_m": float(means.mean()),
-        "mean_ate_band_m": [float(means.min()), float(means.max())],
-        "lost_frames": sum(each.lost_frames for each in every),
-        "breaks": sum(each.breaks for each in every),
-        "ms_per_frame": {
-            "median": float(np.median(frames_ms)),
-            "p95": float(np.percentile(frames_ms, 95)),
-        },
-        "stages_ms": {stage: float(np.median(values)) for stage, values in stages.items()},
-        "mapping_ms_per_frame": float(np.mean([each.mapping_ms for each in every])),
+        "dataset": str(dataset),
+        "scale": scale,
+        "frames_per_agent": frames,
+        "stride": stride,
+        "seeds": list(seeds),
     }
 
 
@@ -254,13 +171,8 @@ def _line(variant: str, agent: str, seed: int, run: AgentRun) -> str:
     median_ms = float(np.median(run.frames_ms)) if run.frames_ms else 0.0
     return (
         f"{variant} {agent} seed {seed}: ATE {100 * run.ate_rmse_m:.2f} cm, "
-        f"{run.lost_frames} lost, {median_ms:.1f} ms per frame"
+        f"{run.lost_frames} lost, {run.breaks} breaks, {median_ms:.1f} ms per frame"
     )
-
-
-def _no_descriptor(colour: NDArray[np.uint8]) -> Descriptor:
-    """Loops are off: nobody will look at it."""
-    return Descriptor("none", np.ones(1, np.float32))
 
 
 def _with_solver(config: SlamConfig, name: str) -> SlamConfig:

@@ -1,11 +1,14 @@
 """`magic bench track DATASET`: accuracy and speed of tracking, without loop closure.
 
-Runs the whole local SLAM of every agent once per solver on the same frames. `--ablation` runs each
-pose initialisation, pyramid depth and part of the tracker in turn instead, as the paper's table.
+Runs the whole local SLAM of every agent once per solver, side by side on the same frames.
+`--ablations` compares each pose initialisation, pyramid depth and part of the tracker instead, as
+the paper's table. With several seeds every figure comes with its band: least, median, largest.
 
 Examples:
   magic bench track DATASET --scale 0.5 --solvers gn,adam --frames 60
   magic bench track DATASET --solvers gn --seeds 0,1,2
+  magic bench track DATASET --stride 3
+  magic bench track DATASET --ablations --frames 100
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ class TrackBenchmark:
     """Use every n-th frame: 3 makes the motion three times as fast."""
     solvers: str = "gn"
     """Which solvers, joined by commas: gn, adam (the paper's, slow)."""
-    ablation: bool = False
+    ablations: bool = False
     """Print the ablation table instead of comparing solvers."""
     seeds: str = "0"
     """Seeds, joined by commas; the table shows the band over them."""
@@ -59,15 +62,15 @@ def main(arguments: list[str]) -> int:
         "seeds": _seeds(config.seeds),
         "progress": lambda text: console.print(text, markup=False),
     }
-    if config.ablation:
-        result = benchmark.run_ablation(config.dataset, **shared)
-        console.print(_table(result["variants"]))
+    if config.ablations:
+        result = benchmark.run_ablations(config.dataset, **shared)
+        _show(result["variants"])
     else:
         solvers = [name.strip() for name in config.solvers.split(",")]
         if unknown := set(solvers) - set(benchmark.SOLVERS):
             raise ConfigError(f"--solvers {', '.join(sorted(unknown))}: expected gn or adam")
         result = benchmark.run(config.dataset, solvers=solvers, **shared)
-        console.print(_table(result["solvers"]))
+        _show(result["solvers"])
         if result["speedup"]:
             console.print(f"gn is {result['speedup']:.1f} times as fast as adam")
     if config.json:
@@ -82,28 +85,46 @@ def _seeds(text: str) -> list[int]:
         raise ConfigError(f"--seeds {text}: expected whole numbers, as in 0,1,2") from error
 
 
+def _show(variants: dict) -> None:
+    console.print(_table(variants))
+    console.print(_stages_table(variants))
+
+
 def _table(variants: dict):
-    rows = []
-    for name, found in variants.items():
-        low, high = found["mean_ate_band_m"]
-        agents = " / ".join(f"{100 * value:.2f}" for value in found["ate_rmse_m"].values())
-        times = found["ms_per_frame"]
-        rows.append(
-            [
-                name,
-                f"{100 * found['mean_ate_m']:.2f} ({100 * low:.2f}-{100 * high:.2f})",
-                agents,
-                str(found["lost_frames"]),
-                f"{times['median']:.1f} / {times['p95']:.1f}",
-                f"{found['mapping_ms_per_frame']:.1f}",
-            ]
-        )
+    rows = [_row(name, found) for name, found in variants.items()]
     columns = [
         "variant",
         "mean ATE cm (band)",
         "agents cm",
         "lost",
+        "breaks",
         "ms (median/p95)",
         "mapping ms",
     ]
     return table("Tracking without loop closure", columns, rows)
+
+
+def _row(name: str, found: dict) -> list[str]:
+    low, middle, high = (100 * value for value in found["bands"]["mean_ate_m"])
+    band = f" ({low:.2f}-{high:.2f})" if low != high else ""
+    times = found["ms_per_frame"]
+    return [
+        name,
+        f"{middle:.2f}{band}",
+        " / ".join(f"{100 * value:.2f}" for value in found["ate_rmse_m"].values()),
+        str(found["lost_frames"]),
+        str(found["breaks"]),
+        f"{times['median']:.1f} / {times['p95']:.1f}",
+        f"{found['mapping_ms_per_frame']:.1f}",
+    ]
+
+
+def _stages_table(variants: dict):
+    stages = list(
+        dict.fromkeys(stage for found in variants.values() for stage in found["stages_ms"])
+    )
+    rows = [
+        [name, *(f"{found['stages_ms'].get(stage, 0.0):.1f}" for stage in stages)]
+        for name, found in variants.items()
+    ]
+    return table("Median time per frame by stage, ms", ["variant", *stages], rows)

@@ -6,14 +6,20 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from box_room import CAMERA, room_frame, walk
 
 from magic_agent.slam_config import SlamConfig, SubmapConfig
 from magic_agent.tracking import benchmark
-from magic_agent.tracking.config import TrackingConfig
+from magic_agent.tracking.config import AdamConfig, TrackingConfig
+from magic_agent.tracking.trial import Chain
 from magic_core.data import Frame, write_replica
 from magic_core.errors import ConfigError
+from magic_core.evaluation.trajectory import Trajectory
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import se3
+from magic_core.submap import Descriptor, Keyframe, OdometryEdge, Submap, TrackedFrame
 
 
 class RoomWalk:
@@ -57,6 +63,70 @@ def test_reports_accuracy_and_time_of_a_solver_as_json(recording):
     assert len(lines) == 1
 
 
+def test_bands_hold_every_seed(recording):
+    report = benchmark.run(recording, scale=1.0, solvers=("gn",), seeds=(0, 1))
+    assert report["seeds"] == [0, 1]
+    found = report["solvers"]["gn"]
+    alone = [
+        benchmark.run(recording, scale=1.0, solvers=("gn",), seeds=(seed,))["solvers"]["gn"]
+        for seed in (0, 1)
+    ]
+    values = [each["mean_ate_m"] for each in alone]
+    least, median, largest = found["bands"]["mean_ate_m"]
+    assert [least, largest] == pytest.approx(sorted(values))
+    assert found["mean_ate_m"] == median == pytest.approx(sum(values) / 2)
+    assert least < largest  # the seed does something
+    assert found["bands"]["lost_frames"] == [0.0, 0.0, 0.0]
+
+
+def test_both_solvers_run_side_by_side_and_give_a_speedup(recording):
+    quick = SlamConfig(tracking=TrackingConfig(adam=AdamConfig(iterations=12)))
+    report = benchmark.run(recording, scale=1.0, frames=4, config=quick)
+    assert set(report["solvers"]) == {"gn", "adam"}
+    gn, adam = (report["solvers"][name]["ms_per_frame"]["median"] for name in ("gn", "adam"))
+    assert report["speedup"] == pytest.approx(adam / gn)
+    assert set(report["solvers"]["adam"]["stages_ms"]) >= {"render", "loss", "backward"}
+
+
+def submap(index: int, poses: list, *, odometry: OdometryEdge | None, lost: tuple = ()) -> Submap:
+    frames = [room_frame(pose, number) for number, pose in poses]
+    anchor_from_world = se3.inverse(poses[0][1])
+    return Submap(
+        session="s",
+        agent="a",
+        index=index,
+        camera=CAMERA,
+        gaussians=GaussianCloud.empty(),
+        keyframes=(Keyframe(frames[0].index, 0.0, np.eye(4), frames[0].colour, frames[0].depth),),
+        trajectory=tuple(
+            TrackedFrame(number, number / 30, anchor_from_world @ pose, number in lost)
+            for number, pose in poses
+        ),
+        descriptor=Descriptor("none", np.ones(1, np.float32)),
+        odometry=odometry,
+        world_from_anchor_prior=None,
+    )
+
+
+def test_a_broken_chain_is_judged_part_by_part_and_never_hides_an_error_within_a_part():
+    poses = list(enumerate(walk(12)))
+    truth = Trajectory.from_poses((number / 30, pose) for number, pose in poses)
+    step = se3.inverse(poses[0][1]) @ poses[4][1]
+    off = se3.exp([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
+    right, wrong = (OdometryEdge(0, edge, np.eye(6)) for edge in (step, step @ off))
+    errors = []
+    for edge in (right, None, wrong):
+        chain = Chain()
+        chain.add(submap(0, poses[:4], odometry=None))
+        chain.add(submap(1, poses[4:], odometry=edge, lost=(6,)))
+        errors.append(chain.ate_rmse_m(truth))
+        assert chain.breaks == (edge is None)
+        assert sum(len(part) for part in chain.parts) == 11  # the lost one is not claimed
+    assert errors[0] < 1e-6
+    assert errors[1] < 1e-6
+    assert errors[2] > 0.01
+
+
 def test_refuses_unknown_solvers_and_data_without_truth(recording):
     with pytest.raises(ConfigError, match="newton"):
         benchmark.run(recording, solvers=("newton",))
@@ -67,7 +137,7 @@ def test_refuses_unknown_solvers_and_data_without_truth(recording):
             return Frame(frame.index, frame.timestamp_s, frame.colour, frame.depth)
 
     with pytest.raises(ConfigError, match="ground truth"):
-        benchmark.run_agent(Untrue("agent_0", 2), SlamConfig())
+        benchmark.run_agent(Untrue("agent_0", 2), {"gn": SlamConfig()})
 
 
 def test_ablations_differ_from_the_default_in_one_thing_each():
@@ -78,3 +148,5 @@ def test_ablations_differ_from_the_default_in_one_thing_each():
     assert sum(name.startswith("initialisation=") for name in variants) == 5
     assert variants["adam"].solver == "adam"
     assert variants["sub-map alone"].window.images == 0
+    without = variants["without pose initialisation"]
+    assert (without.initialisation, without.rotation_prealignment) == ("constant_velocity", False)
