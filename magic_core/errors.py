@@ -9,13 +9,21 @@
     ├── WrongState                  FAILED_PRECONDITION  the thing exists but cannot do this now
     │   └── DescriptorModelMismatch FAILED_PRECONDITION  another image encoder
     ├── CorruptData                 DATA_LOSS            bytes do not match checksum or format
-    ├── ResourceExhausted           RESOURCE_EXHAUSTED   a limit or quota is reached
+    ├── ResourceExhausted           RESOURCE_EXHAUSTED   a limit is reached
+    │   ├── QuotaExceeded           RESOURCE_EXHAUSTED   the share of an agent or session is used up
+    │   ├── RateLimited             RESOURCE_EXHAUSTED   more per second than agreed
+    │   ├── Overloaded              RESOURCE_EXHAUSTED   a queue of the server is full
+    │   ├── DiskFull                RESOURCE_EXHAUSTED   the server's disk has no room left
+    │   └── MemoryLow               RESOURCE_EXHAUSTED   the server's memory has no room left
+    ├── Unauthenticated             UNAUTHENTICATED      no token, a wrong one, or one sent in the open
+    ├── PermissionDenied            PERMISSION_DENIED    a caller that is known may not do this
     ├── Unavailable                 UNAVAILABLE          try again later
     ├── DeadlineExceeded            DEADLINE_EXCEEDED    the answer did not come in time
     └── NotSupported                UNIMPLEMENTED        this build or version cannot do it
 
 Each class has one gRPC code and one ErrorInfo reason. `wire.errors` turns them into
-google.rpc.Status and back, so that a client catches the same class the server raised.
+google.rpc.Status and back, so that a client catches the same class the server raised. An error
+that may pass by waiting says how long (`retry_after_s`, google.rpc.RetryInfo on the wire).
 """
 
 from __future__ import annotations
@@ -37,19 +45,29 @@ class MagicError(Exception):
     grpc_code = "UNKNOWN"
     reason = "MAGIC_ERROR"
 
-    def __init__(self, message: str, *, violations: tuple[FieldViolation, ...] = ()) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        violations: tuple[FieldViolation, ...] = (),
+        retry_after_s: float | None = None,
+    ) -> None:
         super().__init__(message)
         self.message = message
         self.violations = violations
+        self.retry_after_s = retry_after_s
 
     def __reduce__(self):  # errors cross process borders; keyword-only arguments need help
-        return _rebuild, (type(self), self.message, self.violations)
+        return _rebuild, (type(self), self.message, self.violations, self.retry_after_s)
 
 
 def _rebuild(
-    cls: type[MagicError], message: str, violations: tuple[FieldViolation, ...]
+    cls: type[MagicError],
+    message: str,
+    violations: tuple[FieldViolation, ...],
+    retry_after_s: float | None,
 ) -> MagicError:
-    return cls(message, violations=violations)
+    return cls(message, violations=violations, retry_after_s=retry_after_s)
 
 
 class InvalidInput(MagicError):
@@ -98,6 +116,36 @@ class CorruptData(MagicError):
 class ResourceExhausted(MagicError):
     grpc_code = "RESOURCE_EXHAUSTED"
     reason = "RESOURCE_EXHAUSTED"
+
+
+class QuotaExceeded(ResourceExhausted):
+    reason = "QUOTA_EXCEEDED"
+
+
+class RateLimited(ResourceExhausted):
+    reason = "RATE_LIMITED"
+
+
+class Overloaded(ResourceExhausted):
+    reason = "OVERLOADED"
+
+
+class DiskFull(ResourceExhausted):
+    reason = "DISK_FULL"
+
+
+class MemoryLow(ResourceExhausted):
+    reason = "MEMORY_LOW"
+
+
+class Unauthenticated(MagicError):
+    grpc_code = "UNAUTHENTICATED"
+    reason = "UNAUTHENTICATED"
+
+
+class PermissionDenied(MagicError):
+    grpc_code = "PERMISSION_DENIED"
+    reason = "PERMISSION_DENIED"
 
 
 class Unavailable(MagicError):

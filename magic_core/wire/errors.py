@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import grpc
-from google.protobuf import any_pb2
+from google.protobuf import any_pb2, duration_pb2
 from google.protobuf.message import DecodeError, Message
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
@@ -18,7 +18,7 @@ MAX_DETAIL_CHARACTERS = 2000
 
 
 def status_of(error: MagicError) -> status_pb2.Status:
-    """A google.rpc.Status with ErrorInfo, and BadRequest when fields are violated."""
+    """A google.rpc.Status with ErrorInfo; BadRequest for violated fields, RetryInfo for a wait."""
     info = error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN)
     details = [_packed(info)]
     if error.violations:
@@ -28,6 +28,10 @@ def status_of(error: MagicError) -> status_pb2.Status:
                 field=violation.field, description=violation.description[:MAX_DETAIL_CHARACTERS]
             )
         details.append(_packed(bad))
+    if error.retry_after_s is not None:
+        delay = duration_pb2.Duration()
+        delay.FromNanoseconds(round(error.retry_after_s * 1e9))
+        details.append(_packed(error_details_pb2.RetryInfo(retry_delay=delay)))
     return status_pb2.Status(
         code=code_pb2.Code.Value(error.grpc_code),
         message=error.message[:MAX_DETAIL_CHARACTERS],
@@ -44,11 +48,11 @@ def error_of(call: grpc.RpcError) -> MagicError:
     """The error that a failed call stands for: by its ErrorInfo reason, else by its gRPC code."""
     code: grpc.StatusCode = call.code()  # type: ignore[attr-defined]
     message = call.details() or code.name  # type: ignore[attr-defined]
-    reason, violations = _details(call)
+    reason, violations, retry_after_s = _details(call)
     kind = error_class(reason, code.name)
     if kind is MagicError and reason is None:
         message = f"{code.name}: {message}"
-    return kind(message, violations=violations)
+    return kind(message, violations=violations, retry_after_s=retry_after_s)
 
 
 def error_class(reason: str | None, code: str) -> type[MagicError]:
@@ -56,11 +60,15 @@ def error_class(reason: str | None, code: str) -> type[MagicError]:
     return _BY_REASON.get(reason) or _BY_CODE.get(code, MagicError)
 
 
-def _details(call: grpc.RpcError) -> tuple[str | None, tuple[FieldViolation, ...]]:
-    reason, violations = None, ()
+def _details(
+    call: grpc.RpcError,
+) -> tuple[str | None, tuple[FieldViolation, ...], float | None]:
+    """(ErrorInfo reason, violated fields, seconds to wait), as far as the status says."""
+    reason, violations, retry_after_s = None, (), None
     status = _rich_status(call)
     for detail in status.details if status is not None else ():
         info, bad = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
+        retry = error_details_pb2.RetryInfo()
         with contextlib.suppress(DecodeError):
             if detail.Unpack(info) and info.domain == DOMAIN:
                 reason = info.reason
@@ -68,7 +76,9 @@ def _details(call: grpc.RpcError) -> tuple[str | None, tuple[FieldViolation, ...
                 violations = tuple(
                     FieldViolation(v.field, v.description) for v in bad.field_violations
                 )
-    return reason, violations
+            elif detail.Unpack(retry):
+                retry_after_s = max(0.0, retry.retry_delay.ToNanoseconds() * 1e-9)
+    return reason, violations, retry_after_s
 
 
 def _rich_status(call: grpc.RpcError) -> status_pb2.Status | None:
@@ -103,6 +113,8 @@ _BY_CODE: dict[str, type[MagicError]] = {
     "ABORTED": errors.WrongState,
     "DATA_LOSS": errors.CorruptData,
     "RESOURCE_EXHAUSTED": errors.ResourceExhausted,
+    "UNAUTHENTICATED": errors.Unauthenticated,
+    "PERMISSION_DENIED": errors.PermissionDenied,
     "UNAVAILABLE": errors.Unavailable,
     "DEADLINE_EXCEEDED": errors.DeadlineExceeded,
     "UNIMPLEMENTED": errors.NotSupported,

@@ -15,9 +15,11 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from magic_core.errors import CorruptData, MagicError, NotFound, ResourceExhausted
+from magic_core.errors import CorruptData, DiskFull, NotFound
 
 _READ_BYTES = 1 << 20
+DISK_RETRY_S = 15.0
+"""How long callers are asked to wait when the disk is full."""
 
 
 class BlobFolder:
@@ -101,7 +103,7 @@ class BlobWriter:
         return self._digest.hexdigest()
 
     def write(self, data: bytes) -> None:
-        """Append bytes; ResourceExhausted when the disk is full."""
+        """Append bytes; DiskFull when there is no room."""
         with translated_disk_errors():
             self._file.write(data)
         self._digest.update(data)
@@ -121,15 +123,15 @@ class BlobWriter:
 
 
 class translated_disk_errors:  # noqa: N801  # a context manager reads as a verb
-    """Raise ResourceExhausted for a full disk."""
+    """Raise DiskFull, which passes once there is room again, for a full disk."""
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            exhausted: MagicError = ResourceExhausted("the server's disk is full; try again later")
-            raise exhausted from error
+            message = "the server's disk is full; try again once there is room"
+            raise DiskFull(message, retry_after_s=DISK_RETRY_S) from error
 
 
 def sync_folder(folder: Path) -> None:

@@ -42,6 +42,14 @@ def test_every_error_comes_back_as_itself(kind: type[MagicError]) -> None:
     assert (caught.message, caught.violations) == (raised.message, violations)
 
 
+def test_how_long_to_wait_crosses_the_wire() -> None:
+    status = grpc_status_of(errors.RateLimited("slow down", retry_after_s=1.25))
+    caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
+    assert caught.retry_after_s == 1.25
+    retry = rpc_status.from_call(FailedCall(*status[:3])).details[-1]  # type: ignore[arg-type]
+    assert retry.type_url == "type.googleapis.com/google.rpc.RetryInfo"
+
+
 def test_a_status_reads_as_google_rpc_status() -> None:
     error = errors.InvalidInput.field("odometry", "is bent")
     parsed = rpc_status.from_call(FailedCall(*grpc_status_of(error)[:3]))  # type: ignore[arg-type]
