@@ -22,21 +22,15 @@ from magic_core.render.layout import CHUNK, f32
 from magic_core.render.simd import (
     absolute,
     bits,
-    claim,
     fma,
     lane_sum,
-    load,
-    load3,
-    load4,
     maximum,
     minimum,
     select,
     splat,
     square_root,
-    store,
-    store3,
-    store4,
 )
+from magic_core.render.simd_memory import claim, load, load3, load4, store, store3, store4
 from magic_core.render.vecmath import exp
 
 # Rows of the planar state.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from magic_core.render.jit import kernel
-from magic_core.render.simd import claim
+from magic_core.render.simd_memory import claim
 
 
 @kernel

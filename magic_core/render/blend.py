@@ -36,26 +36,28 @@ from magic_core.render.layout import (
     f32,
 )
 from magic_core.render.simd import (
-    BLOCK_HEIGHT,
-    BLOCK_WIDTH,
     bits,
-    claim,
-    column_bits,
     fma,
     fnma,
-    load,
     maximum,
     minimum,
-    prefetch,
-    read,
     select,
     splat,
+    trailing_zeros,
+    zero_unless,
+)
+from magic_core.render.simd_memory import (
+    BLOCK_HEIGHT,
+    BLOCK_WIDTH,
+    claim,
+    column_bits,
+    load,
+    prefetch,
+    read,
     store,
     store_block,
     store_columns,
-    trailing_zeros,
     write,
-    zero_unless,
 )
 from magic_core.render.vecmath import exp_of_8
 

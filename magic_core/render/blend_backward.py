@@ -41,23 +41,25 @@ from magic_core.render.layout import (
     f32,
 )
 from magic_core.render.simd import (
+    fma,
+    fnma,
+    minimum,
+    reciprocal,
+    splat,
+    trailing_zeros,
+    zero_unless,
+)
+from magic_core.render.simd_memory import (
     BLOCK_HEIGHT,
     BLOCK_WIDTH,
     claim,
-    fma,
-    fnma,
     load,
     load_block,
-    minimum,
     prefetch,
     read,
-    reciprocal,
-    splat,
     store,
     store_sums10,
-    trailing_zeros,
     write,
-    zero_unless,
 )
 from magic_core.render.vecmath import exp_of_8
 

@@ -80,7 +80,17 @@ def kernel(function: Callable) -> Any:
     No fast-math: NaN must keep its meaning where Gaussians are culled, and forward and backward
     must round alike. Multiply-adds that matter are written as `fma`.
     """
-    dispatcher: Any = numba.njit(nogil=True, error_model="numpy", boundscheck=False)(function)
+    return _compiled(function, fastmath=False)
+
+
+def fast_kernel(function: Callable) -> Any:
+    """Like `kernel`, with fast-math: for sums of finite numbers, whose loops then use vectors."""
+    return _compiled(function, fastmath=True)
+
+
+def _compiled(function: Callable, *, fastmath: bool) -> Any:
+    compile_ = numba.njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=fastmath)
+    dispatcher: Any = compile_(function)
     if kernel_cache_folder() is not None:
         dispatcher._cache = _KernelCache(function)
     return dispatcher

@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from magic_core.render.lanes import LANES
-from magic_core.render.simd import BLOCK_HEIGHT, BLOCK_WIDTH
+from magic_core.render.simd_memory import BLOCK_HEIGHT, BLOCK_WIDTH
 
 f32 = np.float32
 

@@ -29,19 +29,8 @@ import numpy as np
 from magic_core.render.jit import inlined, kernel
 from magic_core.render.lanes import LANES
 from magic_core.render.layout import f32
-from magic_core.render.simd import (
-    absolute,
-    claim,
-    fma,
-    fnma,
-    lane_sum,
-    load,
-    read,
-    select,
-    splat,
-    store,
-    zero_unless,
-)
+from magic_core.render.simd import absolute, fma, fnma, lane_sum, select, splat, zero_unless
+from magic_core.render.simd_memory import claim, load, read, store
 
 RADIUS = 5
 _C1, _C2 = f32(0.01**2), f32(0.03**2)

@@ -19,25 +19,20 @@ from magic_core.render.lanes import LANES
 from magic_core.render.layout import CHUNK, RECORD, f32
 from magic_core.render.simd import (
     absolute,
-    atomic_add,
     bits,
     ceil,
-    claim,
     float_bits,
     floor,
     fma,
     fnma,
-    load,
-    load3,
-    load4,
     maximum,
     minimum,
     select,
     splat,
     square_root,
-    store,
     trailing_zeros,
 )
+from magic_core.render.simd_memory import atomic_add, claim, load, load3, load4, store
 from magic_core.render.vecmath import log
 
 _ZERO, _ONE, _TWO = f32(0.0), f32(1.0), f32(2.0)

@@ -29,20 +29,16 @@ from magic_core.render.project import (
     to_camera,
 )
 from magic_core.render.simd import (
-    claim,
     fma,
     fnma,
     lane_sum,
-    load,
     maximum,
     select,
     splat,
     square_root,
-    store,
-    store3,
-    store4,
     zero_unless,
 )
+from magic_core.render.simd_memory import claim, load, store, store3, store4
 
 _INPUTS = 14
 _SUMS = _INPUTS * LANES  # the ten sums of each Gaussian, one row per sum

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from magic_core.render import simd, vecmath
+from magic_core.render import simd_memory as memory
 from magic_core.render.lanes import LANES, choose_lanes
 
 f32 = np.float32
@@ -22,21 +23,21 @@ def vectors(count, seed=0):
 
 @njit
 def _arithmetic(a, b, c, out):
-    x, y, z = simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)
-    simd.store(out, 0, x + y)
-    simd.store(out, LANES, x - y)
-    simd.store(out, 2 * LANES, x * y)
-    simd.store(out, 3 * LANES, x / y)
-    simd.store(out, 4 * LANES, simd.fma(x, y, z))
-    simd.store(out, 5 * LANES, simd.fnma(x, y, z))
-    simd.store(out, 6 * LANES, simd.minimum(x, y))
-    simd.store(out, 7 * LANES, simd.maximum(x, y))
-    simd.store(out, 8 * LANES, simd.select(x > y, z, x))
-    simd.store(out, 9 * LANES, simd.zero_unless((x >= y) & (z < x), z))
-    simd.store(out, 10 * LANES, simd.square_root(simd.absolute(x)))
-    simd.store(out, 11 * LANES, simd.floor(x))
-    simd.store(out, 12 * LANES, simd.ceil(x))
-    simd.store(out, 13 * LANES, simd.splat(a[3]))
+    x, y, z = memory.load(a, 0), memory.load(b, 0), memory.load(c, 0)
+    memory.store(out, 0, x + y)
+    memory.store(out, LANES, x - y)
+    memory.store(out, 2 * LANES, x * y)
+    memory.store(out, 3 * LANES, x / y)
+    memory.store(out, 4 * LANES, simd.fma(x, y, z))
+    memory.store(out, 5 * LANES, simd.fnma(x, y, z))
+    memory.store(out, 6 * LANES, simd.minimum(x, y))
+    memory.store(out, 7 * LANES, simd.maximum(x, y))
+    memory.store(out, 8 * LANES, simd.select(x > y, z, x))
+    memory.store(out, 9 * LANES, simd.zero_unless((x >= y) & (z < x), z))
+    memory.store(out, 10 * LANES, simd.square_root(simd.absolute(x)))
+    memory.store(out, 11 * LANES, simd.floor(x))
+    memory.store(out, 12 * LANES, simd.ceil(x))
+    memory.store(out, 13 * LANES, simd.splat(a[3]))
     return simd.bits(x <= y), simd.bits((x < y) | (x > z))
 
 
@@ -59,7 +60,7 @@ def test_arithmetic_is_that_of_numpy_lane_by_lane():
 
 @njit
 def _comparisons(a, b):
-    x, y = simd.load(a, 0), simd.load(b, 0)
+    x, y = memory.load(a, 0), memory.load(b, 0)
     return simd.bits(x > y) | simd.bits(x >= y) | simd.bits(x < y) | simd.bits(x <= y)
 
 
@@ -72,10 +73,10 @@ def test_comparisons_with_nan_are_false():
 
 @njit
 def _interleaved(source, three, four):
-    a, b, c = simd.load3(source, 0)
-    simd.store3(three, 0, c, a, b)
-    a, b, c, d = simd.load4(source, 0)
-    simd.store4(four, 0, d, c, b, a)
+    a, b, c = memory.load3(source, 0)
+    memory.store3(three, 0, c, a, b)
+    a, b, c, d = memory.load4(source, 0)
+    memory.store4(four, 0, d, c, b, a)
 
 
 def test_interleaved_streams_come_apart_and_together():
@@ -90,29 +91,29 @@ def test_interleaved_streams_come_apart_and_together():
 
 @njit
 def _blocks(plane, copy, width):
-    simd.store_block(copy, 2 * width + 3, width, simd.load_block(plane, width + 5, width))
+    memory.store_block(copy, 2 * width + 3, width, memory.load_block(plane, width + 5, width))
 
 
 def test_blocks_are_four_pixels_wide():
     plane = np.arange(12 * 20, dtype=np.float32).reshape(12, 20)
     copy = np.zeros_like(plane)
     _blocks(plane.ravel(), copy.reshape(-1), 20)
-    height = simd.BLOCK_HEIGHT
+    height = memory.BLOCK_HEIGHT
     expected = np.zeros_like(plane)
     expected[2 : 2 + height, 3:7] = plane[1 : 1 + height, 5:9]
     np.testing.assert_array_equal(copy, expected)
-    assert simd.BLOCK_WIDTH * height == LANES
+    assert memory.BLOCK_WIDTH * height == LANES
 
 
 @njit
 def _sums(a, out):
-    simd.store_sums10(
-        out, 0, simd.load(a, 0), simd.load(a, LANES), simd.load(a, 2 * LANES),
-        simd.load(a, 3 * LANES), simd.load(a, 4 * LANES), simd.load(a, 5 * LANES),
-        simd.load(a, 6 * LANES), simd.load(a, 7 * LANES), simd.load(a, 8 * LANES),
-        simd.load(a, 9 * LANES),
+    memory.store_sums10(
+        out, 0, memory.load(a, 0), memory.load(a, LANES), memory.load(a, 2 * LANES),
+        memory.load(a, 3 * LANES), memory.load(a, 4 * LANES), memory.load(a, 5 * LANES),
+        memory.load(a, 6 * LANES), memory.load(a, 7 * LANES), memory.load(a, 8 * LANES),
+        memory.load(a, 9 * LANES),
     )  # fmt: skip
-    return simd.lane_sum(simd.load(a, 0))
+    return simd.lane_sum(memory.load(a, 0))
 
 
 def test_sums_over_lanes_land_in_order():
@@ -127,10 +128,10 @@ def test_sums_over_lanes_land_in_order():
 def _bit_columns(words, columns, back):
     for bit in range(256 // LANES):
         for part in range(64 // LANES):
-            column = simd.column_bits(words, part * LANES, np.uint32(bit))
+            column = memory.column_bits(words, part * LANES, np.uint32(bit))
             columns[bit] |= np.uint64(column) << np.uint64(part * LANES)
     for part in range(0, 64, LANES):
-        simd.store_columns(back, part, columns, part)
+        memory.store_columns(back, part, columns, part)
 
 
 def test_bit_matrices_transpose_and_return():
@@ -147,10 +148,10 @@ def test_bit_matrices_transpose_and_return():
 @njit
 def _functions(x, out, n):
     for i in range(0, n, LANES):
-        v = simd.load(x, i)
-        simd.store(out, i, vecmath.exp(v))
-        simd.store(out, n + i, vecmath.log(simd.absolute(v) + simd.splat(f32(1e-6))))
-        simd.store(out, 2 * n + i, simd.reciprocal(v))
+        v = memory.load(x, i)
+        memory.store(out, i, vecmath.exp(v))
+        memory.store(out, n + i, vecmath.log(simd.absolute(v) + simd.splat(f32(1e-6))))
+        memory.store(out, 2 * n + i, simd.reciprocal(v))
 
 
 def test_exponential_and_logarithm_are_accurate():
@@ -168,7 +169,7 @@ def test_exponential_and_logarithm_are_accurate():
 @njit
 def _short_exponential(t, out, n):
     for i in range(0, n, LANES):
-        simd.store(out, i, vecmath.exp_of_8(simd.load(t, i)))
+        memory.store(out, i, vecmath.exp_of_8(memory.load(t, i)))
 
 
 def test_the_short_exponential_is_accurate_on_its_range():
@@ -181,7 +182,7 @@ def test_the_short_exponential_is_accurate_on_its_range():
 
 @njit
 def _first_free(counter):
-    return simd.claim(counter, np.int64(1))
+    return memory.claim(counter, np.int64(1))
 
 
 def test_claims_count_up():
