@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from magic_core.errors import CorruptData, InvalidInput, ResourceExhausted
 from magic_core.gaussians.cloud import GaussianCloud
+from magic_core.gaussians.morton import BITS, morton_codes
 
 MAGIC = b"MGSC"
 VERSION = 1
@@ -55,7 +56,7 @@ def encode_compact(cloud: GaussianCloud, options: CompactOptions = CompactOption
     range. Positions that do not fit 2^21 steps per axis get a coarser step.
     """
     grid, origin, step = _position_grid(cloud.means, options.position_step_m)
-    order = np.argsort(_morton(grid), kind="stable")
+    order = np.argsort(morton_codes(grid), kind="stable")
     grid, cloud = grid[order], cloud.select(order)
     log_scales = np.log(np.maximum(cloud.scales.astype(np.float64), 1e-12))
     scale_range = _range(log_scales, 0.0, 0.0)
@@ -172,28 +173,8 @@ def _position_grid(means: NDArray[np.float32], step: float) -> tuple[NDArray, ND
         return np.zeros((0, 3), np.int64), np.zeros(3), step
     points = means.astype(np.float64)
     origin = points.min(axis=0)
-    step = max(step, float((points.max(axis=0) - origin).max()) / (2**21 - 1))
+    step = max(step, float((points.max(axis=0) - origin).max()) / (2**BITS - 1))
     return np.rint((points - origin) / step).astype(np.int64), origin, step
-
-
-def _morton(grid: NDArray) -> NDArray[np.uint64]:
-    """63-bit Morton codes (n,) of (n, 3) integers below 2^21."""
-    code = np.zeros(len(grid), np.uint64)
-    for axis in range(3):
-        x = grid[:, axis].astype(np.uint64)
-        for shift, mask in _SPREAD:
-            x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-        code |= x << np.uint64(axis)
-    return code
-
-
-_SPREAD = (
-    (32, 0x001F00000000FFFF),
-    (16, 0x001F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 def _zigzag(values: NDArray) -> NDArray[np.uint32]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.gaussians import GaussianCloud
+from magic_core.gaussians.morton import in_morton_order
 from magic_core.geometry import Camera
 from magic_core.submap import Submap
 
@@ -34,13 +35,14 @@ class View:
 
 
 def coarse_merge(submaps: Sequence[PlacedSubmap]) -> GaussianCloud:
-    """All Gaussians in the world frame, appended (the paper's coarse stage).
+    """All Gaussians in the world frame, appended (the paper's coarse stage), in Morton order.
 
     Agents send each Gaussian once, so no intersection check is needed.
     """
-    return GaussianCloud.concatenate(
+    appended = GaussianCloud.concatenate(
         [placed.submap.gaussians.transformed(placed.world_from_anchor) for placed in submaps]
     )
+    return in_morton_order(appended)
 
 
 def views_of(submaps: Sequence[PlacedSubmap]) -> list[View]:
