@@ -5,6 +5,7 @@
     │   └── ConfigError             INVALID_ARGUMENT     a setting is unknown or out of range
     ├── DataError                   FAILED_PRECONDITION  a dataset is missing or not in its layout
     ├── NotFound                    NOT_FOUND            a named thing does not exist
+    │   └── NotLocalized            NOT_FOUND            an image fits no place of the map
     ├── AlreadyExists               ALREADY_EXISTS       a name is taken by something else
     ├── WrongState                  FAILED_PRECONDITION  the thing exists but cannot do this now
     │   └── DescriptorModelMismatch FAILED_PRECONDITION  another image encoder
@@ -92,6 +93,10 @@ class DataError(MagicError):
 class NotFound(MagicError):
     grpc_code = "NOT_FOUND"
     reason = "NOT_FOUND"
+
+
+class NotLocalized(NotFound):
+    reason = "NOT_LOCALIZED"
 
 
 class AlreadyExists(MagicError):

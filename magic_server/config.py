@@ -9,6 +9,7 @@ from magic_core.errors import ConfigError
 from magic_core.wire import SubmapLimits, Transport
 from magic_server.globalmap import MergeConfig
 from magic_server.jobs import JobConfig
+from magic_server.localize_config import LocalizeConfig
 from magic_server.loops import LoopConfig
 from magic_server.posegraph import PoseGraphConfig
 from magic_server.registration import RegistrationConfig
@@ -71,3 +72,4 @@ class ServerConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     posegraph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)

@@ -12,9 +12,11 @@ import asyncio
 import dataclasses
 import logging
 from collections import deque
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
 
 import numpy as np
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core.wire import names, records
 from magic_server.config import ServerConfig
@@ -23,7 +25,9 @@ from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import solve_pose_graph, verify_loop
 from magic_server.loops import SubmapKey, select_candidates
 from magic_server.places import DescriptorIndex
-from magic_server.store import SessionRow, Store, StoredSubmap, Vertex
+from magic_server.posegraph import PoseGraphProblem, PoseGraphSolution
+from magic_server.pruning import without
+from magic_server.store import Deleted, NewSolution, SessionRow, Store, StoredSubmap, Vertex
 from magic_server.tasks import TaskScope
 
 logger = logging.getLogger(__name__)
@@ -53,6 +57,8 @@ class SessionCoordinator:
         self._config = config
         self._index = DescriptorIndex(session.dimension)
         self._index_lock = asyncio.Lock()
+        # Held while the store and what is kept here change together.
+        self._editing = asyncio.Lock()
         self._arrived: deque[Vertex] = deque()
         self._pending: deque[records.LoopCandidate] = deque()
         self._verifying = 0
@@ -72,6 +78,8 @@ class SessionCoordinator:
                 await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
             else:
                 self._arrived.append(vertex)
+        for removed in await self._store.submaps.removed(self.session):
+            self.graph.add_removed(removed)
         for loop in await self._store.loops.all(self.session):
             self.graph.set_loop(loop)
             if loop.verdict == "PENDING":
@@ -97,6 +105,58 @@ class SessionCoordinator:
         self._arrived.append(vertex)
         self._dirty = True
         self._notify()
+
+    async def remove(
+        self,
+        gone: Callable[[], set[str]],
+        erase: Callable[[NewSolution | None], Awaitable[Deleted]],
+        *,
+        agent: str | None = None,
+    ) -> Deleted:
+        """Delete sub-maps: `erase` takes them out of the store, together with their poses.
+
+        The solution without them is a new revision at once; then the graph is solved again.
+        `agent` names an agent that goes with them; the odometry of others is carried on.
+        """
+        async with self._editing:
+            message, solution = await self._pruned(gone())
+            deleted = await erase(solution)
+            # No await since the store's transaction: what it held is what is known here.
+            removed = gone()
+            self.graph.remove(removed, keep_odometry=agent is None)
+            if agent is not None:
+                self.graph.forget_removed(agent)
+            self._arrived = deque(v for v in self._arrived if v.name not in removed)
+            self._pending = deque(
+                loop for loop in self._pending if removed.isdisjoint((loop.source, loop.target))
+            )
+            if message is not None:
+                self.board.publish(message)
+            self._dirty = True
+            async with self._index_lock:
+                await self._in_thread(_forget, self._index, removed)
+        self._notify()
+        await self._tell_idle()
+        return deleted
+
+    async def _pruned(
+        self, gone: set[str]
+    ) -> tuple[mapping_pb.PoseSnapshot | None, NewSolution | None]:
+        """The newest solution without sub-maps, as a message and for the store."""
+        snapshot = self.board.snapshot
+        if not snapshot.revision:
+            return None, None
+        kept = await self._store.loops.kept(self.session)
+        message = await self._in_thread(
+            lambda: without(
+                snapshot,
+                gone,
+                accepted=self.graph.loops_without(gone),
+                kept=sum(gone.isdisjoint(ends) for ends in kept),
+                known_starts=self.graph.known_starts,
+            )
+        )
+        return message, NewSolution(message.revision, message.SerializeToString())
 
     @property
     def busy(self) -> bool:
@@ -126,7 +186,9 @@ class SessionCoordinator:
         wanted = self.graph.names_of(agent)
         try:
             async with asyncio.timeout(timeout_s):
-                while not wanted <= {pose.submap for pose in self.board.of_agent(agent).poses}:
+                while not wanted & self.graph.names_of(agent) <= {
+                    pose.submap for pose in self.board.of_agent(agent).poses
+                }:
                     await self.board.newer_than(self.board.revision)
         except TimeoutError:
             return False
@@ -154,7 +216,8 @@ class SessionCoordinator:
             self._searching = True
             vertex = self._arrived.popleft()
             try:
-                await self._search(vertex)
+                async with self._editing:
+                    await self._search(vertex)
             except Exception:
                 # The store does not say "searched": the next start looks again.
                 logger.exception("looking for loops of %s failed", vertex.name)
@@ -163,6 +226,8 @@ class SessionCoordinator:
                 await self._tell_idle()
 
     async def _search(self, vertex: Vertex) -> None:
+        if vertex.name not in self.graph:
+            return  # deleted meanwhile
         config = self._config.loops
         async with self._index_lock:
             hits = await self._in_thread(
@@ -198,8 +263,11 @@ class SessionCoordinator:
             self._verifying += 1
             try:
                 settled = await self._verified(loop)
-                await self._store.loops.settle(self.session, settled)
-                self.graph.set_loop(settled)
+                async with self._editing:
+                    if loop.source not in self.graph or loop.target not in self.graph:
+                        continue  # deleted meanwhile
+                    await self._store.loops.settle(self.session, settled)
+                    self.graph.set_loop(settled)
                 if settled.verdict == "ACCEPTED":
                     self._dirty = True
                     self._notify()
@@ -255,7 +323,15 @@ class SessionCoordinator:
 
     async def _solve(self) -> None:
         problem = await self._in_thread(self.graph.problem)
+        if not problem.vertices:
+            return
         solution = await self._jobs.run(solve_pose_graph, problem, self._config.posegraph)
+        async with self._editing:
+            # What was deleted meanwhile must not come back; the graph is solved again anyway.
+            if all(name in self.graph for name in problem.vertices):
+                await self._publish(problem, solution)
+
+    async def _publish(self, problem: PoseGraphProblem, solution: PoseGraphSolution) -> None:
         revision = self.board.revision + 1
         message, data, kept = await self._in_thread(self.graph.solved, problem, solution, revision)
         await self._store.loops.save_solution(
@@ -287,6 +363,12 @@ class SessionCoordinator:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _forget(index: DescriptorIndex, names_: set[str]) -> None:
+    for name in names_:
+        if name in index:
+            index.remove(name)
 
 
 def _key(name: str) -> SubmapKey:

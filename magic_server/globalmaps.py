@@ -55,6 +55,7 @@ class GlobalMaps:
         self._threads = threads
         self._config = config
         self._tasks = TaskScope("global maps")
+        self._under_way: dict[int, set[asyncio.Task[None]]] = {}
         self._changed = asyncio.Event()
         self._stopping = False
 
@@ -74,6 +75,13 @@ class GlobalMaps:
     async def close(self) -> None:
         """Stop; operations under way begin again after the next start."""
         await self._tasks.close()
+
+    async def forget(self, session: SessionRow) -> None:
+        """Stop what is under way in a session that is being deleted."""
+        mine = self._under_way.pop(session.id, set())
+        for task in mine:
+            task.cancel()
+        await asyncio.gather(*mine, return_exceptions=True)
 
     async def build(self, request: map_pb.BuildGlobalMapRequest) -> records.OperationStatus:
         """The operation of a request, begun now unless it was before."""
@@ -107,7 +115,10 @@ class GlobalMaps:
         self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
     ) -> None:
         work = self._run(operation, session, request)
-        self._tasks.start(work, name=f"{session.name}/{operation}")
+        task = self._tasks.start(work, name=f"{session.name}/{operation}")
+        mine = self._under_way.setdefault(session.id, set())
+        mine.add(task)
+        task.add_done_callback(mine.discard)
 
     async def _run(
         self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
@@ -136,8 +147,12 @@ class GlobalMaps:
         root = self._store.folder
         folder = Path(await self._in_thread(tempfile.mkdtemp, None, _MERGE_PREFIX, root))
         try:
-            task = await self._task(coordinator, chosen, request, folder)
-            outcome = await self._followed(operation, task)
+            try:
+                task = await self._task(coordinator, chosen, request, folder)
+                outcome = await self._followed(operation, task)
+            except Exception as error:
+                _require_all(coordinator, chosen, error)
+                raise
             await self._keep(operation, session, snapshot.revision, chosen, outcome)
         finally:
             await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
@@ -223,6 +238,16 @@ class GlobalMaps:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _require_all(
+    coordinator: SessionCoordinator, chosen: list[mapping_pb.CorrectedPose], cause: Exception
+) -> None:
+    """Raise WrongState when a merge failed because a sub-map of it was deleted."""
+    gone = [pose.submap for pose in chosen if pose.submap not in coordinator.graph]
+    if gone:
+        message = f"{gone[0]} was deleted while it was merged; build the map again"
+        raise WrongState(message) from cause
 
 
 def chosen_poses(

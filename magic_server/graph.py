@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 
 import numpy as np
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core.wire import convert, names, records
+from magic_server.bridging import bridged
 from magic_server.poseboard import PoseBoard
 from magic_server.posegraph import Edge, PoseGraphProblem, PoseGraphSolution
-from magic_server.store import Vertex
+from magic_server.store import RemovedSubmap, Vertex
 
 
 class SessionGraph:
@@ -21,11 +23,26 @@ class SessionGraph:
         self._vertices: dict[str, Vertex] = {}
         self._loops: dict[tuple[str, str], records.LoopCandidate] = {}
         self._poses: dict[str, np.ndarray] = {}
+        self._removed: dict[str, RemovedSubmap] = {}
+
+    def __contains__(self, submap: str) -> bool:
+        return submap in self._vertices
 
     @property
     def accepted_count(self) -> int:
         """Accepted loops."""
         return sum(loop.verdict == "ACCEPTED" for loop in self._loops.values())
+
+    def loops_without(self, gone: Collection[str]) -> int:
+        """Accepted loops that touch none of these sub-maps."""
+        left = (loop for ends, loop in self._loops.items() if not {*ends} & {*gone})
+        return sum(loop.verdict == "ACCEPTED" for loop in left)
+
+    @property
+    def known_starts(self) -> set[str]:
+        """The sub-maps with a known start, deleted ones included."""
+        all_known = (*self._vertices.values(), *self._removed.values())
+        return {one.name for one in all_known if one.prior is not None}
 
     def names_of(self, agent: str) -> set[str]:
         """The sub-maps of an agent, all by resource name."""
@@ -34,6 +51,25 @@ class SessionGraph:
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
         self._vertices[vertex.name] = vertex
+
+    def add_removed(self, removed: RemovedSubmap) -> None:
+        """A deleted sub-map, over which odometry is carried on."""
+        self._removed[removed.name] = removed
+
+    def remove(self, submaps: Collection[str], *, keep_odometry: bool) -> None:
+        """Forget sub-maps and their loops; with `keep_odometry`, not how their neighbours lie."""
+        for name in submaps:
+            vertex = self._vertices.pop(name, None)
+            self._poses.pop(name, None)
+            if vertex is not None and keep_odometry:
+                self.add_removed(RemovedSubmap(name, vertex.odometry, vertex.prior))
+        gone = set(submaps)
+        self._loops = {ends: loop for ends, loop in self._loops.items() if gone.isdisjoint(ends)}
+
+    def forget_removed(self, agent: str) -> None:
+        """Nothing is left of an agent, all by resource name: its indices begin at 0 again."""
+        prefix = f"{agent}/"
+        self._removed = {n: r for n, r in self._removed.items() if not n.startswith(prefix)}
 
     def set_loop(self, loop: records.LoopCandidate) -> None:
         """A candidate, new or with news."""
@@ -50,12 +86,13 @@ class SessionGraph:
     def problem(self) -> PoseGraphProblem:
         """The graph as it is now."""
         vertices = list(self._vertices.values())
+        odometry, priors = _bridged_odometry(vertices, dict(self._removed))
         accepted = [loop for loop in list(self._loops.values()) if loop.verdict == "ACCEPTED"]
         return PoseGraphProblem(
             vertices=tuple(vertex.name for vertex in vertices),
-            odometry=tuple(edge for vertex in vertices if (edge := _odometry(vertex))),
+            odometry=odometry,
             loops=tuple(_loop_edge(loop) for loop in accepted),
-            priors={v.name: v.prior for v in vertices if v.prior is not None},
+            priors=priors,
             initial=dict(self._poses) or None,
         )
 
@@ -95,16 +132,25 @@ def initial_board(session: str, stored: bytes | None) -> PoseBoard:
     return PoseBoard(mapping_pb.PoseSnapshot.FromString(stored))
 
 
-def _odometry(vertex: Vertex) -> Edge | None:
-    if vertex.odometry is None:
-        return None
-    session, agent, _ = names.parse_submap(vertex.name)
-    return Edge(
-        source=names.submap_name(session, agent, vertex.odometry.previous_index),
-        target=vertex.name,
-        source_from_target=vertex.odometry.previous_from_anchor,
-        information=vertex.odometry.information,
-    )
+def _bridged_odometry(
+    vertices: list[Vertex], removed: dict[str, RemovedSubmap]
+) -> tuple[tuple[Edge, ...], dict[str, np.ndarray]]:
+    """The odometry edges of sub-maps and their known starts, carried on over deleted ones."""
+    edges, priors = [], {}
+    for vertex in vertices:
+        odometry, prior = bridged(vertex, removed)
+        if prior is not None:
+            priors[vertex.name] = prior
+        if odometry is not None:
+            session, agent, _ = names.parse_submap(vertex.name)
+            edge = Edge(
+                source=names.submap_name(session, agent, odometry.previous_index),
+                target=vertex.name,
+                source_from_target=odometry.previous_from_anchor,
+                information=odometry.information,
+            )
+            edges.append(edge)
+    return tuple(edges), priors
 
 
 def _loop_edge(loop: records.LoopCandidate) -> Edge:

@@ -6,7 +6,7 @@ import asyncio
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
-from magic_core.errors import Unavailable
+from magic_core.errors import MagicError, Unavailable
 from magic_core.wire import convert
 
 
@@ -17,7 +17,7 @@ class PoseBoard:
         self._snapshot = snapshot
         self._of_agent: dict[str, mapping_pb.PoseSnapshot] = {}
         self._changed = asyncio.Event()
-        self._closed = False
+        self._closed: MagicError | None = None
 
     @property
     def snapshot(self) -> mapping_pb.PoseSnapshot:
@@ -35,9 +35,9 @@ class PoseBoard:
         self._of_agent.clear()
         self._wake()
 
-    def close(self) -> None:
-        """Send everyone who waits away: the server is stopping."""
-        self._closed = True
+    def close(self, error: MagicError | None = None) -> None:
+        """Send everyone who waits away: with the error, or because the server is stopping."""
+        self._closed = error or Unavailable("the server is stopping; watch again later")
         self._wake()
 
     def of_agent(self, agent: str) -> mapping_pb.PoseSnapshot:
@@ -47,10 +47,10 @@ class PoseBoard:
         return self._of_agent[agent]
 
     async def newer_than(self, revision: int) -> None:
-        """Wait until the solution's revision is above `revision`; Unavailable when closed."""
+        """Wait until the solution's revision is above `revision`; raises once closed."""
         while self.revision <= revision or self._closed:
             if self._closed:
-                raise Unavailable("the server is stopping; watch again later")
+                raise self._closed
             await self._changed.wait()
 
     def _wake(self) -> None:

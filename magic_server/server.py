@@ -27,7 +27,9 @@ from magic_server.config import ServerConfig
 from magic_server.globalmaps import GlobalMaps
 from magic_server.interceptors import ErrorInterceptor
 from magic_server.jobs import ProcessExecutor
+from magic_server.localizing import Localizer
 from magic_server.receiving import SubmapReceiver
+from magic_server.removal import Removal
 from magic_server.servicers import GlobalMapServicer, MappingServicer, SessionServicer
 from magic_server.sessions import Sessions
 from magic_server.store import Store
@@ -59,6 +61,7 @@ class Server:
         self.sessions = Sessions(self._store, **shared)
         self._maps = GlobalMaps(self._store, self.sessions, **shared)
         self._receiver = SubmapReceiver(self._store, threads=self._threads, limits=config.limits)
+        self.localizer = Localizer(self._store, **shared)
         self._health = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
         self._grpc: grpc.aio.Server | None = None
 
@@ -125,13 +128,18 @@ class Server:
             self._store,
             self.sessions,
             receiver=self._receiver,
+            localizer=self.localizer,
             threads=self._threads,
             config=self.config,
         )
         mapping_grpc.add_MappingServiceServicer_to_server(mapping, server)
         maps = GlobalMapServicer(self._store, self._maps, threads=self._threads)
         map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
-        sessions = SessionServicer(self._store, threads=self._threads)
+        sessions = SessionServicer(
+            self._store,
+            Removal(self._store, self.sessions, self._maps),
+            threads=self._threads,
+        )
         session_grpc.add_SessionServiceServicer_to_server(sessions, server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
         others = (health.SERVICE_NAME, reflection.SERVICE_NAME)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
 from concurrent.futures import Executor
+from contextlib import asynccontextmanager
 
+from magic_core.errors import MagicError
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
@@ -47,8 +50,10 @@ class Sessions:
         async with self._lock:
             found = self._coordinators.get(session.name)
             if found is None:
+                # It may have been deleted while the lock was held.
+                stored = await self._store.agents.session(session.name)
                 found = SessionCoordinator(
-                    session,
+                    stored,
                     self._store,
                     jobs=self._jobs,
                     threads=self._threads,
@@ -58,9 +63,30 @@ class Sessions:
                 self._coordinators[session.name] = found
             return found
 
+    @asynccontextmanager
+    async def forgotten(self, session: SessionRow, reason: MagicError) -> AsyncIterator[None]:
+        """While the block deletes a session from the store nobody works on it.
+
+        Those who watch it are sent away with `reason`.
+        """
+        async with self._lock:
+            found = self._coordinators.pop(session.name, None)
+            if found is not None:
+                await found.close()
+            try:
+                yield
+            except BaseException:
+                if found is not None:
+                    found.board.close()  # it was not deleted: watchers come back to a new one
+                raise
+            if found is not None:
+                found.board.close(reason)
+
     def submap_stored(self, agent: AgentRow, vertex: Vertex) -> None:
         """Tell the session's coordinator of a sub-map that is durable."""
-        self._coordinators[agent.session.name].submap_stored(vertex)
+        # Without one its session is being deleted, or begun again once that has failed.
+        if found := self._coordinators.get(agent.session.name):
+            found.submap_stored(vertex)
 
     async def named(self, session: str) -> SessionCoordinator:
         """The coordinator of a session's id; NotFound when there is no such session."""

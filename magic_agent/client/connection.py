@@ -30,6 +30,8 @@ class ClientConfig:
     """How long `connect` waits for the server."""
     rpc_timeout_s: float = 20.0
     """Deadline of one ordinary call, seconds."""
+    localize_timeout_s: float = 60.0
+    """Deadline of placing one image in the map, seconds."""
     submit_timeout_s: float = 300.0
     """Deadline of one attempt to send a sub-map, seconds."""
     download_timeout_s: float = 600.0
@@ -86,11 +88,17 @@ class Connection:
         """Close the connection; calls under way are cancelled."""
         await self._channel.close(grace=None)
 
-    async def idempotent(self, method: Callable[..., Awaitable[_T]], request: Any) -> _T:
+    async def idempotent(
+        self,
+        method: Callable[..., Awaitable[_T]],
+        request: Any,
+        *,
+        timeout_s: float | None = None,
+    ) -> _T:
         """The answer of a call that may be repeated: it gets a deadline and is tried again."""
 
         async def attempt() -> _T:
-            return await method(request, timeout=self.config.rpc_timeout_s)
+            return await method(request, timeout=timeout_s or self.config.rpc_timeout_s)
 
         return await self.retried(attempt)
 

@@ -202,8 +202,9 @@ class MappingCalls(Connection):
     ) -> records.Localization:
         """The pose of an RGB-D image in the stored map.
 
-        `colour` (h, w, 3) uint8 RGB, `depth` (h, w) float32 metres. Raises NotSupported on a
-        server that does not offer it yet.
+        `colour` (h, w, 3) uint8 RGB, `depth` (h, w) float32 metres, `descriptor` of the image by
+        the session's model. Raises NotLocalized, with the sub-maps that were tried and why each
+        was refused, when the image fits no place.
         """
         request = mapping_pb.LocalizeRequest(
             session=names.session_name(session),
@@ -214,7 +215,9 @@ class MappingCalls(Connection):
             metres_per_unit=0.001,
             descriptor=geometry.descriptor_to_proto(descriptor),
         )
-        answer = await self.idempotent(self.mapping_stub.Localize, request)
+        answer = await self.idempotent(
+            self.mapping_stub.Localize, request, timeout_s=self.config.localize_timeout_s
+        )
         return convert.localization_from_proto(answer)
 
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterable
 from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import submap_pb2
 
-from magic_agent.client.connection import Connection
+from magic_agent.client.connection import Connection, new_id
 from magic_core.errors import CorruptData
 from magic_core.submap import Submap
 from magic_core.wire import (
@@ -37,10 +37,18 @@ class SessionCalls(Connection):
         pages = self.pages(self.session_stub.ListSessions, session_pb.ListSessionsRequest())
         return tuple([convert.session_from_proto(s) async for p in pages for s in p.sessions])
 
-    async def delete_session(self, session: str) -> None:
-        """Delete a session. Raises NotSupported on a server that does not offer it yet."""
-        request = session_pb.DeleteSessionRequest(name=names.session_name(session))
-        await self.idempotent(self.session_stub.DeleteSession, request)
+    async def delete_session(
+        self, session: str, *, force: bool = False, request_id: str | None = None
+    ) -> records.Deletion:
+        """Delete a session with all it holds.
+
+        Raises WrongState while one of its agents has not finished, unless `force` is set.
+        """
+        request = session_pb.DeleteSessionRequest(
+            name=names.session_name(session), request_id=request_id or new_id(), force=force
+        )
+        answer = await self.idempotent(self.session_stub.DeleteSession, request)
+        return records.Deletion(answer.submap_count, answer.freed_bytes)
 
     async def get_agent(self, session: str, agent: str) -> records.AgentInfo:
         """An agent."""
@@ -54,10 +62,18 @@ class SessionCalls(Connection):
         pages = self.pages(self.session_stub.ListAgents, request)
         return tuple([convert.agent_from_proto(a) async for p in pages for a in p.agents])
 
-    async def delete_agent(self, session: str, agent: str) -> None:
-        """Delete an agent. Raises NotSupported on a server that does not offer it yet."""
-        request = session_pb.DeleteAgentRequest(name=names.agent_name(session, agent))
-        await self.idempotent(self.session_stub.DeleteAgent, request)
+    async def delete_agent(
+        self, session: str, agent: str, *, force: bool = False, request_id: str | None = None
+    ) -> records.Deletion:
+        """Delete an agent with its sub-maps; its name is free again.
+
+        Raises WrongState while the agent has not finished, unless `force` is set.
+        """
+        request = session_pb.DeleteAgentRequest(
+            name=names.agent_name(session, agent), request_id=request_id or new_id(), force=force
+        )
+        answer = await self.idempotent(self.session_stub.DeleteAgent, request)
+        return records.Deletion(answer.submap_count, answer.freed_bytes)
 
     async def get_submap(self, name: str) -> tuple[records.SubmapInfo, submap_pb2.SubmapHeader]:
         """A sub-map's summary, and its header as submitted."""
@@ -74,10 +90,19 @@ class SessionCalls(Connection):
         pages = self.pages(self.session_stub.ListSubmaps, request)
         return tuple([convert.submap_info_from_proto(s) async for p in pages for s in p.submaps])
 
-    async def delete_submap(self, name: str) -> None:
-        """Delete a sub-map. Raises NotSupported on a server that does not offer it yet."""
-        request = session_pb.DeleteSubmapRequest(name=name)
-        await self.idempotent(self.session_stub.DeleteSubmap, request)
+    async def delete_submap(
+        self, name: str, *, force: bool = False, request_id: str | None = None
+    ) -> records.Deletion:
+        """Delete a sub-map with its loops and the maps merged from it; the odometry of its
+        neighbours is joined.
+
+        Raises WrongState while its agent has not finished, unless `force` is set.
+        """
+        request = session_pb.DeleteSubmapRequest(
+            name=name, request_id=request_id or new_id(), force=force
+        )
+        answer = await self.idempotent(self.session_stub.DeleteSubmap, request)
+        return records.Deletion(answer.submap_count, answer.freed_bytes)
 
     async def download_submap(self, name: str) -> Submap:
         """A stored sub-map, decoded from the bytes that were submitted."""

@@ -359,6 +359,28 @@ def localization_from_proto(message: mapping_pb.LocalizeResponse) -> records.Loc
         fitness=message.fitness,
         rmse_m=message.rmse_m,
         inliers=message.inliers,
+        overlap=message.overlap,
+        similarity=message.similarity,
+        confidence=message.confidence,
+        information=geometry.information_from_list(message.information),
+    )
+
+
+def localization_to_proto(found: records.Localization) -> mapping_pb.LocalizeResponse:
+    """Where an image was taken as its message."""
+    return mapping_pb.LocalizeResponse(
+        world_from_camera=geometry.pose_to_proto(found.world_from_camera),
+        component=found.component,
+        revision=found.revision,
+        submap=found.submap,
+        anchor_from_camera=geometry.pose_to_proto(found.anchor_from_camera),
+        fitness=found.fitness,
+        rmse_m=found.rmse_m,
+        inliers=found.inliers,
+        overlap=found.overlap,
+        similarity=found.similarity,
+        confidence=found.confidence,
+        information=geometry.information_to_list(found.information),
     )
 
 

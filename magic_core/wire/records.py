@@ -230,3 +230,19 @@ class Localization:
     fitness: float
     rmse_m: float
     inliers: int
+    overlap: float
+    """Share of the image that the sub-map's images confirm, 0 to 1."""
+    similarity: float
+    """Cosine of the descriptors, -1 to 1."""
+    confidence: float
+    """Agreement of image and map where they overlap, 0 to 1."""
+    information: NDArray[np.float64]
+    """(6, 6) of anchor_from_camera, 1/m^2 and 1/rad^2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deletion:
+    """What was deleted."""
+
+    submap_count: int
+    freed_bytes: int

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from magicslam.v1 import submap_pb2
 
+from magic_core.errors import MagicError
+from magic_core.geometry import Camera
 from magic_core.wire import decode_submap, geometry, images
 from magic_server.store.rows import StoredSubmap
 
@@ -38,6 +40,17 @@ class PlacedFiles:
     name: str
     stored: StoredSubmap
     world_from_anchor: np.ndarray  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class QueryImage:
+    """An encoded RGB-D image that is to be placed in the map; it was checked."""
+
+    camera: Camera
+    colour: bytes
+    colour_media_type: str
+    depth_png: bytes
+    metres_per_unit: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +82,29 @@ def verify_loop(
     from magic_server.registration import register
 
     return register(_prepared(source, config), _prepared(target, config), config)
+
+
+def localize_image(
+    image: QueryImage, targets: tuple[StoredSubmap, ...], config: RegistrationConfig
+) -> list[RegistrationResult | None]:
+    """Register an image to sub-maps, up to and with the first that accepts it.
+
+    The result of each is target_from_camera, None where a sub-map could not be read.
+    """
+    from magic_server.registration import prepare, register
+
+    view = prepare(_query_view(image), config)
+    results: list[RegistrationResult | None] = []
+    for target in targets:
+        try:
+            prepared = _prepared(target, config)
+        except (OSError, MagicError):  # deleted meanwhile, or damaged on disk
+            results.append(None)
+            continue
+        results.append(register(view, prepared, config))
+        if results[-1] is not None and results[-1].accepted:
+            break
+    return results
 
 
 def solve_pose_graph(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSolution:
@@ -119,6 +155,16 @@ def _prepared(stored: StoredSubmap, config: RegistrationConfig) -> PreparedView:
     from magic_server.registration import prepare
 
     return prepare(_view(stored, config.max_keyframes), config)
+
+
+def _query_view(image: QueryImage) -> AnchorView:
+    from magic_server.registration import AnchorView
+
+    size = (image.camera.width, image.camera.height)
+    colour = images.decode_colour(image.colour, image.colour_media_type, size=size)
+    unit = image.metres_per_unit
+    depth = images.decode_depth(image.depth_png, metres_per_unit=unit, size=size)
+    return AnchorView(camera=image.camera, colour=colour, depth=depth)
 
 
 def _view(stored: StoredSubmap, max_keyframes: int) -> AnchorView:

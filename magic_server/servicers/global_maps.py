@@ -13,8 +13,7 @@ from magic_core.errors import InvalidInput
 from magic_core.wire import convert, names
 from magic_server.globalmaps import GlobalMaps
 from magic_server.servicers.downloads import file_chunks
-from magic_server.servicers.mapping import check_request_id
-from magic_server.servicers.pages import page_limit, page_start, token_of
+from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.store import Store
 
 Context = grpc.aio.ServicerContext

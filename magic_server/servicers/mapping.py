@@ -13,14 +13,15 @@ from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import submap_pb2
 
-from magic_core.errors import FieldViolation, InvalidInput, NotSupported
+from magic_core.errors import FieldViolation, InvalidInput
 from magic_core.wire import MAX_CHUNK_BYTES, convert, geometry, names, records
 from magic_core.wire.header_check import request_id_problem
 from magic_core.wire.submap import decode_trajectory
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
+from magic_server.localizing import Localizer
 from magic_server.receiving import SubmapReceiver
-from magic_server.servicers.pages import page_limit, page_start, token_of
+from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.sessions import Sessions
 from magic_server.store import Store, require_model
 
@@ -37,12 +38,14 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         sessions: Sessions,
         *,
         receiver: SubmapReceiver,
+        localizer: Localizer,
         threads: Executor,
         config: ServerConfig,
     ) -> None:
         self._store = store
         self._sessions = sessions
         self._receiver = receiver
+        self._localizer = localizer
         self._threads = threads
         self._config = config
 
@@ -164,7 +167,9 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
     async def Localize(  # noqa: N802
         self, request: mapping_pb.LocalizeRequest, context: Context
     ) -> mapping_pb.LocalizeResponse:
-        raise NotSupported("this server does not localise images yet")
+        coordinator = await self._coordinator(request.session)
+        found = await self._localizer.localize(request, coordinator)
+        return convert.localization_to_proto(found)
 
     async def _loop_messages(
         self, loops: list[records.LoopCandidate]
@@ -211,12 +216,6 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             min_similarity=request.min_similarity,
         )
         return found, coordinator
-
-
-def check_request_id(request_id: str) -> None:
-    """Raise InvalidInput unless it is 1 to 128 printable characters."""
-    if problem := request_id_problem(request_id):
-        raise InvalidInput.field("request_id", problem)
 
 
 def _check_registration(request: mapping_pb.RegisterAgentRequest, max_dimension: int) -> None:

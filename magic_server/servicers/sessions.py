@@ -11,10 +11,11 @@ from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 from magicslam.v1 import submap_pb2
 
-from magic_core.errors import NotFound, NotSupported
+from magic_core.errors import NotFound
 from magic_core.wire import convert, names
+from magic_server.removal import Removal
 from magic_server.servicers.downloads import file_chunks
-from magic_server.servicers.pages import page_limit, page_start, token_of
+from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.store import Store
 
 Context = grpc.aio.ServicerContext
@@ -23,8 +24,9 @@ Context = grpc.aio.ServicerContext
 class SessionServicer(session_grpc.SessionServiceServicer):
     """Sessions, their agents and their sub-maps."""
 
-    def __init__(self, store: Store, *, threads: Executor) -> None:
+    def __init__(self, store: Store, removal: Removal, *, threads: Executor) -> None:
         self._store = store
+        self._removal = removal
         self._threads = threads
 
     async def GetSession(  # noqa: N802
@@ -50,7 +52,13 @@ class SessionServicer(session_grpc.SessionServiceServicer):
     async def DeleteSession(  # noqa: N802
         self, request: session_pb.DeleteSessionRequest, context: Context
     ) -> session_pb.DeleteSessionResponse:
-        raise NotSupported("this server does not delete sessions yet")
+        check_request_id(request.request_id)
+        deleted = await self._removal.session(
+            request.name, request_id=request.request_id, force=request.force
+        )
+        return session_pb.DeleteSessionResponse(
+            submap_count=deleted.submap_count, freed_bytes=deleted.freed_bytes
+        )
 
     async def GetAgent(  # noqa: N802
         self, request: session_pb.GetAgentRequest, context: Context
@@ -79,7 +87,13 @@ class SessionServicer(session_grpc.SessionServiceServicer):
     async def DeleteAgent(  # noqa: N802
         self, request: session_pb.DeleteAgentRequest, context: Context
     ) -> session_pb.DeleteAgentResponse:
-        raise NotSupported("this server does not delete agents yet")
+        check_request_id(request.request_id)
+        deleted = await self._removal.agent(
+            request.name, request_id=request.request_id, force=request.force
+        )
+        return session_pb.DeleteAgentResponse(
+            submap_count=deleted.submap_count, freed_bytes=deleted.freed_bytes
+        )
 
     async def GetSubmap(  # noqa: N802
         self, request: session_pb.GetSubmapRequest, context: Context
@@ -116,7 +130,13 @@ class SessionServicer(session_grpc.SessionServiceServicer):
     async def DeleteSubmap(  # noqa: N802
         self, request: session_pb.DeleteSubmapRequest, context: Context
     ) -> session_pb.DeleteSubmapResponse:
-        raise NotSupported("this server does not delete sub-maps yet")
+        check_request_id(request.request_id)
+        deleted = await self._removal.submap(
+            request.name, request_id=request.request_id, force=request.force
+        )
+        return session_pb.DeleteSubmapResponse(
+            submap_count=deleted.submap_count, freed_bytes=deleted.freed_bytes
+        )
 
     async def DownloadSubmap(  # noqa: N802
         self, request: session_pb.DownloadSubmapRequest, context: Context

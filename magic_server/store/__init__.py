@@ -2,11 +2,13 @@
 
 from magic_server.store.agents import require_model
 from magic_server.store.blobs import BlobFolder, BlobWriter
+from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
 from magic_server.store.maps import NewMap, OpenOperation
 from magic_server.store.rows import (
     AgentRow,
     MapFile,
     NewSubmap,
+    RemovedSubmap,
     SessionRow,
     StoredSubmap,
     Vertex,
@@ -18,11 +20,15 @@ __all__ = [
     "AgentRow",
     "BlobFolder",
     "BlobWriter",
+    "Deleted",
+    "DeletionRequest",
     "FirstAnswer",
     "MapFile",
     "NewMap",
+    "NewSolution",
     "NewSubmap",
     "OpenOperation",
+    "RemovedSubmap",
     "SessionRow",
     "Store",
     "StoredSubmap",

@@ -12,7 +12,7 @@ from magic_core.wire import names, records
 from magic_core.wire.convert import moment
 from magic_server.store.database import Database
 from magic_server.store.rows import AgentRow, SessionRow
-from magic_server.store.schema import agents, loops, sessions, snapshots, submaps
+from magic_server.store.schema import agents, loops, removed_submaps, sessions, snapshots, submaps
 
 
 class AgentTable:
@@ -71,6 +71,14 @@ class AgentTable:
             raise NotFound(f"{names.agent_name(session, agent)} does not exist; register it first")
         return found
 
+    async def active(self, session: SessionRow) -> list[str]:
+        """The ids of a session's agents that have not finished, oldest first."""
+        query = sa.select(agents.c.name).where(
+            agents.c.session_id == session.id, sa.not_(agents.c.finished)
+        )
+        async with self._database.read() as connection:
+            return list(await connection.scalars(query.order_by(agents.c.id)))
+
     async def sessions(self) -> list[SessionRow]:
         """Every session, oldest first."""
         async with self._database.read() as connection:
@@ -78,11 +86,10 @@ class AgentTable:
             return [SessionRow(r.id, r.name, r.model_id, r.dimension) for r in rows]
 
     async def next_submap_index(self, agent: AgentRow) -> int:
-        """One more than the agent's last sub-map."""
+        """One more than the agent's last sub-map, deleted ones included."""
         async with self._database.read() as connection:
-            last = sa.select(sa.func.max(submaps.c.number)).where(submaps.c.agent_id == agent.id)
-            found = await connection.scalar(last)
-        return 0 if found is None else found + 1
+            last = sa.select(_last_number(agent.id))
+            return (await connection.execute(last)).scalar_one() + 1
 
     async def session_page(
         self, *, after: int = 0, limit: int = 100, session: str | None = None
@@ -115,7 +122,7 @@ class AgentTable:
         query = sa.select(
             agents,
             sa.select(sa.func.count()).where(mine).scalar_subquery().label("submap_count"),
-            sa.select(sa.func.max(submaps.c.number)).where(mine).scalar_subquery().label("last"),
+            _last_number(agents.c.id).label("last"),
         ).where(agents.c.session_id == session.id, agents.c.id > after)
         if agent is not None:
             query = query.where(agents.c.name == agent)
@@ -172,6 +179,20 @@ async def _touch(connection: AsyncConnection, agent_id: int, now: float) -> None
     await connection.execute(change.values(last_seen_at=now))
 
 
+def _last_number(agent: int | sa.Column) -> sa.ColumnElement[int]:
+    """The highest number an agent has used, deleted sub-maps included; -1 before the first."""
+    highest = [
+        sa.func.coalesce(
+            sa.select(sa.func.max(table.c.number))
+            .where(table.c.agent_id == agent)
+            .scalar_subquery(),
+            -1,
+        )
+        for table in (submaps, removed_submaps)
+    ]
+    return sa.func.max(*highest)
+
+
 def _count(column: sa.Column) -> sa.ScalarSelect:
     return sa.select(sa.func.count()).where(column == sessions.c.id).scalar_subquery()
 
@@ -208,5 +229,5 @@ def _agent_info(session: str, row: sa.Row) -> records.AgentInfo:
         registered_at=moment(row.registered_at),
         last_seen_at=moment(row.last_seen_at),
         submap_count=row.submap_count,
-        next_submap_index=0 if row.last is None else row.last + 1,
+        next_submap_index=row.last + 1,
     )

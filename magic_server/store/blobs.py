@@ -65,6 +65,11 @@ class BlobFolder:
         for sha256 in digests:
             self.path(sha256).unlink(missing_ok=True)
 
+    def total_bytes(self, digests: Iterable[str]) -> int:
+        """Length of these blobs together; a missing one counts as nothing."""
+        places = [self.path(sha256) for sha256 in digests]
+        return sum(place.stat().st_size for place in places if place.exists())
+
     def names(self) -> Iterator[str]:
         """The digest of every stored blob."""
         for folder in sorted(self.blobs.iterdir()):
@@ -82,9 +87,12 @@ class BlobFolder:
 
     def read_piece(self, sha256: str, offset: int, length: int = _READ_BYTES) -> bytes:
         """At most `length` bytes from `offset`; empty at the end."""
-        with self.path(sha256).open("rb") as file:
-            file.seek(offset)
-            return file.read(length)
+        try:
+            with self.path(sha256).open("rb") as file:
+                file.seek(offset)
+                return file.read(length)
+        except FileNotFoundError:
+            raise NotFound("what is being read has been deleted") from None
 
 
 class BlobWriter:

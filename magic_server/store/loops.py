@@ -63,6 +63,13 @@ class LoopTable:
         following = rows[limit - 1].id if limit is not None and len(rows) > limit else None
         return [_record(row) for row in rows[:limit]], following
 
+    async def kept(self, session: SessionRow) -> list[tuple[str, str]]:
+        """(source, target) of the loops that the newest solution relies on."""
+        query = sa.select(loops.c.source, loops.c.target)
+        query = query.where(loops.c.session_id == session.id, loops.c.kept)
+        async with self._database.read() as connection:
+            return [(row.source, row.target) for row in await connection.execute(query)]
+
     async def of_submap(self, session: SessionRow, submap: str) -> list[records.LoopCandidate]:
         """The candidates that a sub-map is part of, most similar first."""
         query = sa.select(loops).where(

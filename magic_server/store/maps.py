@@ -8,12 +8,12 @@ import sqlalchemy as sa
 from magicslam.v1 import global_map_service_pb2 as map_pb
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import MagicError, NotFound
+from magic_core.errors import MagicError, NotFound, WrongState
 from magic_core.wire import names, records
 from magic_core.wire.convert import moment
 from magic_server.store.database import Database
 from magic_server.store.rows import MapFile, SessionRow
-from magic_server.store.schema import map_files, maps, operations, sessions
+from magic_server.store.schema import agents, map_files, maps, operations, sessions, submaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,10 @@ class MapTable:
     async def succeed(
         self, operation: int, session: SessionRow, made: NewMap, *, now: float
     ) -> None:
-        """Store a map and that its operation is done, in one transaction."""
+        """Store a map and that its operation is done, in one transaction.
+
+        WrongState when one of its sub-maps was deleted while they were merged.
+        """
         row = {
             "session_id": session.id,
             "component": made.component,
@@ -101,6 +104,7 @@ class MapTable:
             "created_at": now,
         }
         async with self._database.write() as connection:
+            await _require_submaps(connection, session, made.submaps)
             added = await connection.execute(sa.insert(maps), row)
             key = added.inserted_primary_key
             assert key is not None  # the table has an integer primary key
@@ -179,6 +183,16 @@ _OPERATIONS = (
     .join(sessions, sessions.c.id == operations.c.session_id)
     .outerjoin(maps, maps.c.id == operations.c.map_id)
 )
+
+
+async def _require_submaps(
+    connection: AsyncConnection, session: SessionRow, wanted: tuple[str, ...]
+) -> None:
+    query = sa.select(agents.c.name, submaps.c.number).join(agents)
+    rows = await connection.execute(query.where(submaps.c.session_id == session.id))
+    stored = {names.submap_name(session.name, row.name, row.number) for row in rows}
+    if missing := [name for name in wanted if name not in stored]:
+        raise WrongState(f"{missing[0]} was deleted while it was merged; build the map again")
 
 
 async def _update(connection: AsyncConnection, operation: int, values: dict[str, object]) -> None:

@@ -48,6 +48,15 @@ class Vertex:
 
 
 @dataclass(frozen=True, slots=True)
+class RemovedSubmap:
+    """What the pose graph still needs of a deleted sub-map."""
+
+    name: str
+    odometry: OdometryEdge | None
+    prior: NDArray[np.float64] | None  # world_from_anchor (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
 class NewSubmap:
     """A sub-map whose blobs are in place, ready for its transaction."""
 

@@ -18,6 +18,7 @@ sessions = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False),  # seconds since 1970, UTC
     sa.Column("model_id", sa.String(128), nullable=False),
     sa.Column("dimension", sa.Integer, nullable=False),
+    sqlite_autoincrement=True,  # what was deleted is never mistaken for what came after it
 )
 
 agents = sa.Table(
@@ -30,6 +31,7 @@ agents = sa.Table(
     sa.Column("registered_at", sa.Float, nullable=False),
     sa.Column("last_seen_at", sa.Float, nullable=False),
     sa.UniqueConstraint("session_id", "name"),
+    sqlite_autoincrement=True,
 )
 
 submaps = sa.Table(
@@ -57,6 +59,36 @@ submaps = sa.Table(
     sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
     sa.Column("searched", sa.Boolean, nullable=False),  # loop candidates were looked for
     sa.UniqueConstraint("agent_id", "number"),
+    sqlite_autoincrement=True,
+)
+
+# What is still known of a deleted sub-map: its number is not used again, a repeated upload gets its
+# first answer, and its odometry joins the sub-maps before and behind it.
+removed_submaps = sa.Table(
+    "removed_submaps",
+    metadata,
+    sa.Column("agent_id", sa.ForeignKey("agents.id"), primary_key=True),
+    sa.Column("number", sa.Integer, primary_key=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("request_id", sa.String(128), nullable=False),
+    sa.Column("header_sha256", sa.LargeBinary(32), nullable=False),
+    sa.Column("received_at", sa.Float, nullable=False),
+    sa.Column("stored_bytes", sa.Integer, nullable=False),
+    sa.Column("previous_number", sa.Integer),
+    sa.Column("previous_from_anchor", sa.LargeBinary),  # float64 (4, 4)
+    sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
+    sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
+)
+
+# First answers of deletions, so that a repeat gets the same. Rows older than a month are dropped.
+deletions = sa.Table(
+    "deletions",
+    metadata,
+    sa.Column("name", sa.String, primary_key=True),  # resource name
+    sa.Column("request_id", sa.String(128), primary_key=True),
+    sa.Column("submap_count", sa.Integer, nullable=False),
+    sa.Column("freed_bytes", sa.Integer, nullable=False),
+    sa.Column("deleted_at", sa.Float, nullable=False),
 )
 
 submap_blobs = sa.Table(

@@ -21,6 +21,7 @@ from magic_core.errors import WrongState
 from magic_server.store.agents import AgentTable
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.database import Database
+from magic_server.store.deletions import Deletions
 from magic_server.store.loops import LoopTable
 from magic_server.store.maps import MapTable, NewMap
 from magic_server.store.rows import AgentRow, NewSubmap, SessionRow
@@ -44,6 +45,9 @@ class Store:
         self.submaps = SubmapTable(self._database, self.blobs)
         self.loops = LoopTable(self._database)
         self.maps = MapTable(self._database)
+        self.deletions = Deletions(
+            self._database, self.blobs, lock=self._commit_lock, threads=threads
+        )
 
     async def __aenter__(self) -> Self:
         await self.open()
@@ -106,8 +110,12 @@ class Store:
         """Make a merged map durable and its operation done."""
         loop = asyncio.get_running_loop()
         async with self._commit_lock:
-            await loop.run_in_executor(self._threads, self.blobs.adopt, written)
-            await self.maps.succeed(operation, session, made, now=now)
+            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            try:
+                await self.maps.succeed(operation, session, made, now=now)
+            except BaseException:
+                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                raise
 
     async def collect_orphans(self) -> int:
         """Remove blobs that no sub-map and no map refers to; returns how many."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import sqlalchemy as sa
@@ -16,13 +16,14 @@ from magic_server.store.database import Database
 from magic_server.store.rows import (
     AgentRow,
     NewSubmap,
+    RemovedSubmap,
     SessionRow,
     StoredSubmap,
     Vertex,
     pack,
     unpack,
 )
-from magic_server.store.schema import agents, submap_blobs, submaps
+from magic_server.store.schema import agents, removed_submaps, submap_blobs, submaps
 
 _SUMMARY = (
     submaps.c.id,
@@ -56,8 +57,15 @@ class SubmapTable:
         self._blobs = blobs
 
     async def insert(self, agent: AgentRow, submap: NewSubmap, *, now: float) -> None:
-        """The one transaction that makes a sub-map part of its session."""
+        """The one transaction that makes a sub-map part of its session.
+
+        NotFound when its agent was deleted meanwhile.
+        """
         async with self._database.write() as connection:
+            mine = sa.select(agents.c.id).where(agents.c.id == agent.id)
+            if await connection.scalar(mine) is None:
+                name = names.agent_name(agent.session.name, agent.name)
+                raise NotFound(f"{name} was deleted while it submitted a sub-map")
             values = _columns(agent, submap) | {"received_at": now}
             added = await connection.execute(sa.insert(submaps), values)
             key = added.inserted_primary_key
@@ -71,16 +79,15 @@ class SubmapTable:
             await connection.execute(seen)
 
     async def first_answer(self, agent: AgentRow, index: int) -> FirstAnswer | None:
-        """The answer that a stored sub-map got, or None."""
-        query = sa.select(
-            submaps.c.request_id,
-            submaps.c.header_sha256,
-            submaps.c.received_at,
-            submaps.c.stored_bytes,
-        ).where(submaps.c.agent_id == agent.id, submaps.c.number == index)
+        """The answer that a sub-map got when it was stored, deleted or not, or None."""
         async with self._database.read() as connection:
-            row = (await connection.execute(query)).one_or_none()
-        return None if row is None else FirstAnswer(*row)
+            for table in (submaps, removed_submaps):
+                columns = (table.c[field.name] for field in fields(FirstAnswer))
+                mine = sa.and_(table.c.agent_id == agent.id, table.c.number == index)
+                row = (await connection.execute(sa.select(*columns).where(mine))).one_or_none()
+                if row is not None:
+                    return FirstAnswer(*row)
+        return None
 
     async def stored(self, session: SessionRow, agent: str, index: int) -> StoredSubmap:
         """A sub-map's header and blob paths; NotFound when it is not stored."""
@@ -104,6 +111,21 @@ class SubmapTable:
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
         return [_vertex(session, row) for row in rows]
+
+    async def removed(self, session: SessionRow) -> list[RemovedSubmap]:
+        """The deleted sub-maps of agents that are still there."""
+        query = sa.select(removed_submaps, agents.c.name.label("agent")).join(agents)
+        query = query.where(removed_submaps.c.session_id == session.id)
+        async with self._database.read() as connection:
+            rows = (await connection.execute(query)).all()
+        return [
+            RemovedSubmap(
+                names.submap_name(session.name, row.agent, row.number),
+                _odometry(row),
+                unpack(row.prior, 4),
+            )
+            for row in rows
+        ]
 
     async def page(
         self, session: SessionRow, *, agent: str | None = None, after: int = 0, limit: int = 100
@@ -159,18 +181,21 @@ def _columns(agent: AgentRow, submap: NewSubmap) -> dict[str, object]:
     }
 
 
-def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
-    odometry = None
+def _odometry(row: sa.Row) -> OdometryEdge | None:
     motion, information = unpack(row.previous_from_anchor, 4), unpack(row.information, 6)
-    if motion is not None and information is not None:
-        odometry = OdometryEdge(row.previous_number, motion, information)
+    if motion is None or information is None:
+        return None
+    return OdometryEdge(row.previous_number, motion, information)
+
+
+def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
     vector = np.frombuffer(row.descriptor, "<f4").astype(np.float32)
     return Vertex(
         name=names.submap_name(session.name, row.agent, row.number),
         agent=names.agent_name(session.name, row.agent),
         index=row.number,
         descriptor=Descriptor(session.model_id, vector),
-        odometry=odometry,
+        odometry=_odometry(row),
         prior=unpack(row.prior, 4),
         searched=row.searched,
     )

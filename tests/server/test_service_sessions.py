@@ -22,7 +22,6 @@ from magic_core.errors import (
     InvalidInput,
     MagicError,
     NotFound,
-    NotSupported,
     Unavailable,
     WrongState,
 )
@@ -107,26 +106,11 @@ async def test_what_does_not_exist_is_not_found(client: MagicClient) -> None:
         client.get_global_map("sessions/room/maps/1"),
         client.start_global_map("hall"),
         client.finish_agent("room", "agent_9"),
+        client.delete_session("hall"),
+        client.delete_agent("room", "agent_9"),
+        client.delete_submap("sessions/room/agents/agent_0/submaps/0"),
     ):
         with pytest.raises(NotFound):
-            await missing
-
-
-async def test_what_is_not_offered_yet_says_so(client: MagicClient) -> None:
-    submap = make_submap()
-    for missing in (
-        client.delete_session("room"),
-        client.delete_agent("room", "agent_0"),
-        client.delete_submap(submap.name),
-        client.localize(
-            "room",
-            camera=submap.camera,
-            colour=submap.anchor.colour,
-            depth=submap.anchor.depth,
-            descriptor=submap.descriptor,
-        ),
-    ):
-        with pytest.raises(NotSupported):
             await missing
 
 

@@ -1,10 +1,17 @@
-"""Page sizes and page tokens of the list calls. A token is the last row's id."""
+"""Fields that many requests share: request ids, page sizes, page tokens (the last row's id)."""
 
 from __future__ import annotations
 
 from magic_core.errors import InvalidInput
+from magic_core.wire.header_check import request_id_problem
 
 MAX_PAGE_SIZE = 1000
+
+
+def check_request_id(request_id: str) -> None:
+    """Raise InvalidInput unless it is 1 to 128 printable characters."""
+    if problem := request_id_problem(request_id):
+        raise InvalidInput.field("request_id", problem)
 
 
 def page_limit(page_size: int, *, default: int = 100) -> int:
