@@ -40,13 +40,20 @@ async def collect_map(
     *,
     timeout_s: float,
     progress: Callable[[float, str], None],
+    coarse: bool = False,
 ) -> records.GlobalMapInfo:
-    """Have the server merge the largest component and write the result as `map.ply`."""
-    info = await client.build_global_map(session, timeout_s=timeout_s, progress=progress)
+    """Have the server merge the largest component and write the result as `map.ply`.
+
+    With `coarse` the sub-maps are appended alone, and the file is `map_coarse.ply`.
+    """
+    path = folder.coarse_map_path if coarse else folder.map_path
+    info = await client.build_global_map(
+        session, coarse_only=coarse, timeout_s=timeout_s, progress=progress
+    )
     _, ply = await client.download_global_map(info.name, format="ply")
-    partial = folder.map_path.with_suffix(".partial")
+    partial = path.with_suffix(".partial")
     await asyncio.to_thread(partial.write_bytes, ply)
-    partial.replace(folder.map_path)
+    partial.replace(path)
     return info
 
 

@@ -22,6 +22,10 @@ class EvalConfig:
     """Where the data lies now; default: where the run found it."""
     report: bool = True
     """Rewrite report.html too."""
+    lpips_weights: Path | None = None
+    """AlexNet weights for LPIPS (safetensors); default: MAGIC_LPIPS_WEIGHTS or the usual places."""
+    views: int = 48
+    """Most views rendered of each kind, spread evenly over agents and time."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -43,7 +47,9 @@ def main(arguments: list[str]) -> int:
     sources = open_dataset(
         config.dataset or run.dataset, scale=run.scale, max_frames=run.frames, stride=run.stride
     )
-    metrics = measure_again(folder, sources)
+    metrics = measure_again(
+        folder, sources, lpips_weights=config.lpips_weights, views_per_kind=config.views
+    )
     if config.report:
         write_report(folder, sources)
     print_summary(metrics, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from magic_cli.local_run import Outcome
 
 
+VIEWS_PER_KIND = 48
 TIMED_BY_THE_RUN = ("fps", "agents", "merge_s", "gaussians", "wall_s")
 
 
@@ -28,10 +30,11 @@ def measure(
     outcome: Outcome,
     report: bool,
     started: float,
+    lpips_weights: Path | None = None,
 ) -> dict:
     """Evaluate a finished run, write metrics.json and the report, return the metrics."""
     metrics = {
-        **_measured(folder, sources),
+        **_measured(folder, sources, lpips_weights=lpips_weights),
         "fps": _rate(folder, outcome.mapping_s),
         "agents": dict(sorted(outcome.agents.items())),
         "merge_s": round(outcome.merge_s, 2),
@@ -44,23 +47,40 @@ def measure(
     return metrics
 
 
-def measure_again(folder: RunFolder, sources: list[FrameSource]) -> dict:
+def measure_again(
+    folder: RunFolder,
+    sources: list[FrameSource],
+    *,
+    lpips_weights: Path | None = None,
+    views_per_kind: int = VIEWS_PER_KIND,
+) -> dict:
     """Measure a finished run anew; what only the run itself could time is kept as it was."""
     try:
         before = folder.read_metrics()
     except NotFound:  # the run was cut short before it was measured
         before = {}
     unknown: dict[str, Any] = dict.fromkeys(TIMED_BY_THE_RUN)
-    metrics = unknown | before | _measured(folder, sources)
+    measured = _measured(
+        folder, sources, lpips_weights=lpips_weights, views_per_kind=views_per_kind
+    )
+    metrics = unknown | before | measured
     folder.write_metrics(metrics)
     return metrics
 
 
-def _measured(folder: RunFolder, sources: list[FrameSource]) -> dict:
+def _measured(
+    folder: RunFolder,
+    sources: list[FrameSource],
+    *,
+    lpips_weights: Path | None,
+    views_per_kind: int = VIEWS_PER_KIND,
+) -> dict:
     from magic_core.evaluation import evaluate_run
 
     with console.status("measuring the map and the trajectories"):
-        accuracy = evaluate_run(folder, sources=sources)
+        accuracy = evaluate_run(
+            folder, sources=sources, views_per_kind=views_per_kind, lpips_weights=lpips_weights
+        )
     reports = agent_reports(folder)
     return {**accuracy, **agent_metrics(reports), "loops": loop_counts(folder.read_loops())}
 
@@ -101,6 +121,15 @@ def agent_metrics(reports: list[AgentReport]) -> dict:
         "submaps": sum(report.submaps for report in reports),
         "tracking_ms": spread(tracking),
         "mapping_ms": spread(mapping),
+        "left_out": {
+            "frames": sum(report.dropped_frames for report in reports),
+            "keyframes": sum(report.skipped_keyframes for report in reports),
+            "mapping_steps": sum(report.cut_mapping_steps for report in reports),
+            "of_mapping_steps": sum(
+                report.mapping_steps + report.cut_mapping_steps for report in reports
+            ),
+        },
+        "late_ms": spread([ms for report in reports for ms in report.late_ms]),
         "wire_bytes_per_submap": {
             kind: round(statistics.fmean(getattr(size, kind) for size in sizes)) if sizes else None
             for kind in ("compact", "lossless")

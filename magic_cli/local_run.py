@@ -121,13 +121,9 @@ class LocalRun:
                 logs = self._folder.agents_folder
                 raise DataError(f"no sub-map reached the server; see the agents' logs in {logs}")
             start = time.perf_counter()
-            info = await collect_map(
-                client,
-                SESSION,
-                self._folder,
-                timeout_s=self._config.merge_timeout_s,
-                progress=progress.merge,
-            )
+            limits = {"timeout_s": self._config.merge_timeout_s, "progress": progress.merge}
+            await collect_map(client, SESSION, self._folder, coarse=True, **limits)
+            info = await collect_map(client, SESSION, self._folder, **limits)
             self._outcome.merge_s = time.perf_counter() - start
             self._outcome.gaussians = info.gaussian_count
             await collect(client, SESSION, self._folder)

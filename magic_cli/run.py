@@ -55,6 +55,8 @@ class RunConfig(AgentConfig):
     """Longest wait for the merged map."""
     report: bool = True
     """Write report.html and overview.png."""
+    lpips_weights: Path | None = None
+    """AlexNet weights for LPIPS (safetensors); default: MAGIC_LPIPS_WEIGHTS or the usual places."""
     candidates: LoopConfig = field(default_factory=LoopConfig)
     """Server: which similar places are verified."""
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
@@ -96,7 +98,14 @@ def run(config: RunConfig) -> dict:
     outcome = asyncio.run(LocalRun(config, sources, folder).run())
     from magic_cli.evaluation import measure
 
-    metrics = measure(folder, sources, outcome=outcome, report=config.report, started=start)
+    metrics = measure(
+        folder,
+        sources,
+        outcome=outcome,
+        report=config.report,
+        started=start,
+        lpips_weights=config.lpips_weights,
+    )
     print_summary(metrics, folder)
     return metrics
 

@@ -28,15 +28,20 @@ from magic_core.evaluation.trajectory import (
 if TYPE_CHECKING:
     from magic_core.evaluation.accuracy import ground_truth_of, measure_trajectories
     from magic_core.evaluation.evaluate import evaluate_run
-    from magic_core.evaluation.image_metrics import depth_l1, psnr, ssim
+    from magic_core.evaluation.image_metrics import depth_l1, ms_ssim, psnr, ssim
+    from magic_core.evaluation.lpips import Lpips
     from magic_core.evaluation.report import write_report
+    from magic_core.evaluation.rpe import relative_pose_error
 
 _HOMES = {
+    "Lpips": "lpips",
     "depth_l1": "image_metrics",
     "evaluate_run": "evaluate",
     "ground_truth_of": "accuracy",
     "measure_trajectories": "accuracy",
+    "ms_ssim": "image_metrics",
     "psnr": "image_metrics",
+    "relative_pose_error": "rpe",
     "ssim": "image_metrics",
     "write_report": "report",
 }
@@ -45,6 +50,7 @@ __all__ = [
     "AgentReport",
     "Components",
     "LoopRecord",
+    "Lpips",
     "PlacedAnchor",
     "RunFolder",
     "Trajectory",
@@ -55,9 +61,11 @@ __all__ = [
     "ground_truth_of",
     "joint_ate_rmse",
     "measure_trajectories",
+    "ms_ssim",
     "psnr",
     "read_kitti",
     "read_tum",
+    "relative_pose_error",
     "ssim",
     "write_kitti",
     "write_report",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,13 +13,14 @@ from magic_core.data import FrameSource
 from magic_core.errors import InvalidInput, NotFound
 from magic_core.evaluation.ate import ate_rmse, joint_ate_rmse
 from magic_core.evaluation.records import Components
+from magic_core.evaluation.rpe import RelativePoseError, relative_pose_error
 from magic_core.evaluation.run_folder import RunFolder, TrajectoryKind
 from magic_core.evaluation.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryAccuracy:
-    """ATE RMSE in metres; agents without ground truth are absent."""
+    """ATE RMSE in metres, and RPE; agents without ground truth are absent."""
 
     corrected_m: dict[str, float]
     """Per agent, each under its own alignment."""
@@ -30,6 +32,10 @@ class TrajectoryAccuracy:
     """That alignment, (4, 4)."""
     joint_agents: tuple[str, ...]
     """The agents it covers."""
+    relative: dict[str, RelativePoseError]
+    """RPE over one second, per agent, after correction."""
+    relative_tracked: dict[str, RelativePoseError]
+    """The same of odometry alone."""
 
 
 def ground_truth_of(source: FrameSource) -> Trajectory | None:
@@ -52,12 +58,15 @@ def measure_trajectories(run: RunFolder) -> TrajectoryAccuracy:
             pairs[agent] = (estimated, run.read_trajectory(agent, "ground_truth"))
     pairs = {agent: pair for agent, pair in pairs.items() if _overlap(*pair)}
     joint, alignment = (None, None) if not pairs else joint_ate_rmse(list(pairs.values()))
+    corrected, tracked = _pairs(run, "corrected"), _pairs(run, "tracked")
     return TrajectoryAccuracy(
-        corrected_m=_per_agent(run, "corrected"),
-        tracked_m=_per_agent(run, "tracked"),
+        corrected_m={agent: ate_rmse(*pair)[0] for agent, pair in corrected.items()},
+        tracked_m={agent: ate_rmse(*pair)[0] for agent, pair in tracked.items()},
         joint_m=joint,
         truth_from_world=alignment,
         joint_agents=tuple(pairs),
+        relative=_relative(corrected),
+        relative_tracked=_relative(tracked),
     )
 
 
@@ -103,7 +112,8 @@ def _in_component(
     return np.isin(submap, indices)
 
 
-def _per_agent(run: RunFolder, kind: TrajectoryKind) -> dict[str, float]:
+def _pairs(run: RunFolder, kind: TrajectoryKind) -> dict[str, tuple[Trajectory, Trajectory]]:
+    """Each agent's estimate and truth, where they overlap in time."""
     result = {}
     for agent in run.agents():
         if run.has_trajectory(agent, kind) and run.has_trajectory(agent, "ground_truth"):
@@ -112,7 +122,18 @@ def _per_agent(run: RunFolder, kind: TrajectoryKind) -> dict[str, float]:
                 estimated = _own_component(run, agent, estimated)
             pair = (estimated, run.read_trajectory(agent, "ground_truth"))
             if _overlap(*pair):
-                result[agent] = ate_rmse(*pair)[0]
+                result[agent] = pair
+    return result
+
+
+def _relative(
+    pairs: dict[str, tuple[Trajectory, Trajectory]],
+) -> dict[str, RelativePoseError]:
+    """RPE of each agent whose recording is long enough for it."""
+    result = {}
+    for agent, pair in pairs.items():
+        with contextlib.suppress(InvalidInput):
+            result[agent] = relative_pose_error(*pair)
     return result
 
 

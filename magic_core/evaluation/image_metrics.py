@@ -1,4 +1,4 @@
-"""How alike a rendered and a real image are: PSNR, SSIM, depth L1."""
+"""How alike a rendered and a real image are: PSNR, SSIM, MS-SSIM, depth L1."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ Image = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64]
 _WINDOW = 11
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
+_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+MS_SSIM_MIN_SIDE = (_WINDOW - 1) * 2 ** (len(_SCALE_WEIGHTS) - 1) + 1
 
 
 def psnr(rendered: Image, reference: Image) -> float:
@@ -31,13 +33,49 @@ def ssim(rendered: Image, reference: Image) -> float:
     a, b = _both_unit_range(rendered, reference)
     if min(a.shape[:2]) < _WINDOW:
         raise InvalidInput.field("rendered", f"{a.shape[:2]}: SSIM needs at least 11x11 pixels")
+    luminance, contrast = _likeness(a, b)
+    return float(np.mean(luminance * contrast))
+
+
+def ms_ssim(rendered: Image, reference: Image) -> float:
+    """SSIM over five scales of (h, w, 3) images, uint8 or float 0 to 1.
+
+    Wang et al., "Multi-scale structural similarity" (Asilomar 2003). NaN for images with a side
+    below 161 pixels: they have no fifth scale that the window fits into.
+    """
+    a, b = _both_unit_range(rendered, reference)
+    if min(a.shape[:2]) < MS_SSIM_MIN_SIDE:
+        return float("nan")
+    result = 1.0
+    inner = slice(_WINDOW // 2, -(_WINDOW // 2))
+    for scale, weight in enumerate(_SCALE_WEIGHTS):
+        luminance, contrast = _likeness(a, b)
+        if scale == len(_SCALE_WEIGHTS) - 1:
+            part = float(np.mean(luminance * contrast))
+        else:
+            part = float(np.mean(contrast[inner, inner]))
+            a, b = _halved(a), _halved(b)
+        result *= max(part, 0.0) ** weight
+    return result
+
+
+def _likeness(
+    a: NDArray[np.float64], b: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Each pixel's and channel's likeness of luminance, and of contrast and structure."""
     mean_a, mean_b = _window_mean(a), _window_mean(b)
     variance_a = _window_mean(a * a) - mean_a**2
     variance_b = _window_mean(b * b) - mean_b**2
     covariance = _window_mean(a * b) - mean_a * mean_b
-    likeness = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
-    norm = (mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2)
-    return float(np.mean(likeness / norm))
+    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
+    return luminance, (2 * covariance + _C2) / (variance_a + variance_b + _C2)
+
+
+def _halved(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means of 2 x 2 pixels; an odd last row or column is left out."""
+    height, width = (side // 2 * 2 for side in image.shape[:2])
+    even = image[:height, :width]
+    return even.reshape(height // 2, 2, width // 2, 2, -1).mean(axis=(1, 3))
 
 
 def depth_l1(

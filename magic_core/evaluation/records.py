@@ -55,6 +55,16 @@ class AgentReport:
     """Time from the first frame to the last acknowledgement."""
     submap_first_frames: tuple[int, ...] = ()
     """Index of each sub-map's first frame; says which sub-map a frame belongs to."""
+    dropped_frames: int = 0
+    """Frames of a live source that were never looked at, for lack of time."""
+    skipped_keyframes: int = 0
+    """Frames of a live source that were tracked but not mapped, for lack of time."""
+    mapping_steps: int = 0
+    """Optimisation steps taken."""
+    cut_mapping_steps: int = 0
+    """Optimisation steps of the schedule left out for lack of time."""
+    late_ms: tuple[float, ...] = ()
+    """Per frame of a live source, how long after it was due its tracking began."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +173,7 @@ def agent_report_from_json(values: Mapping[str, Any]) -> AgentReport:
     values = dict(values)
     values["camera"] = _known(Camera, values.get("camera", {}))
     values["wire_bytes"] = tuple(_known(WireBytes, item) for item in values.get("wire_bytes", ()))
-    for name in ("keyframes", "tracking_ms", "mapping_ms", "submap_first_frames"):
+    for name in ("keyframes", "tracking_ms", "mapping_ms", "submap_first_frames", "late_ms"):
         values[name] = tuple(values.get(name, ()))
     return _known(AgentReport, values)
 

@@ -1,6 +1,6 @@
 """The folder that one run leaves behind: every path in it, and typed reading and writing.
 
-    config.yaml  metrics.json  report.html  overview.png  map.ply  posegraph.g2o
+    config.yaml  metrics.json  report.html  overview.png  map.ply  map_coarse.ply  posegraph.g2o
     loops.json  components.json
     trajectories/{agent}_{tracked,corrected,ground_truth}.txt    TUM format
     agents/{agent}/report.json
@@ -40,6 +40,7 @@ class RunFolder:
         self.report_path = self.path / "report.html"
         self.overview_path = self.path / "overview.png"
         self.map_path = self.path / "map.ply"
+        self.coarse_map_path = self.path / "map_coarse.ply"
         self.posegraph_path = self.path / "posegraph.g2o"
         self.loops_path = self.path / "loops.json"
         self.components_path = self.path / "components.json"
@@ -124,6 +125,12 @@ class RunFolder:
         from magic_core.gaussians.ply import read_ply
 
         return read_ply(self._existing(self.map_path))
+
+    def read_coarse_map(self) -> GaussianCloud:
+        """The sub-maps appended, before the fine stage of merging."""
+        from magic_core.gaussians.ply import read_ply
+
+        return read_ply(self._existing(self.coarse_map_path))
 
     def write_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Write metrics.json; NaN and infinity become null."""

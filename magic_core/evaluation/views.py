@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magic_core.data import Frame, FrameSource
 from magic_core.errors import NotFound
 from magic_core.evaluation.accuracy import main_component_trajectories
-from magic_core.evaluation.image_metrics import depth_l1, psnr, ssim
+from magic_core.evaluation.image_metrics import depth_l1, ms_ssim, psnr, ssim
 from magic_core.evaluation.run_folder import RunFolder
 from magic_core.evaluation.trajectory import Trajectory
 from magic_core.gaussians import GaussianCloud
@@ -21,6 +21,12 @@ from magic_core.geometry import Camera
 ViewKind = Literal["train", "novel"]
 VIEW_KINDS: tuple[ViewKind, ...] = ("train", "novel")
 _SAME_TIME_S = 1e-3
+
+
+class Perceptual(Protocol):
+    """A perceptual distance of two (h, w, 3) images, such as Lpips."""
+
+    def __call__(self, rendered: NDArray, reference: NDArray) -> float: ...
 
 
 class View(Protocol):
@@ -63,6 +69,10 @@ class ComparedView:
     depth: NDArray[np.float32]  # (h, w) rendered expected depth, metres
     psnr_db: float
     ssim: float
+    ms_ssim: float
+    """NaN for images with a side below 161 pixels."""
+    lpips: float
+    """NaN without the metric's weights."""
     depth_l1_m: float
 
 
@@ -84,20 +94,27 @@ def choose_views(
 
 
 def compare_views(
-    views: Sequence[ChosenView], cloud: GaussianCloud, rasteriser: Renders
+    views: Sequence[ChosenView],
+    cloud: GaussianCloud,
+    rasteriser: Renders,
+    *,
+    perceptual: Perceptual | None = None,
 ) -> Iterator[ComparedView]:
     """Render the map at each view and compare it with the real frame."""
     for view in views:
         frame = view.source[view.index]
         rendered = rasteriser.render(cloud, view.source.camera, view.world_from_camera)
-        colour = np.clip(np.rint(255.0 * rendered.colour), 0, 255).astype(np.uint8)
+        shown = np.clip(rendered.colour, 0.0, 1.0)
+        real = frame.colour.astype(np.float32) / 255.0
         yield ComparedView(
             chosen=view,
             frame=frame,
-            colour=colour,
+            colour=np.rint(255.0 * shown).astype(np.uint8),
             depth=rendered.expected_depth,
-            psnr_db=psnr(rendered.colour, frame.colour.astype(np.float32) / 255.0),
-            ssim=ssim(rendered.colour, frame.colour.astype(np.float32) / 255.0),
+            psnr_db=psnr(shown, real),
+            ssim=ssim(shown, real),
+            ms_ssim=ms_ssim(shown, real),
+            lpips=float("nan") if perceptual is None else perceptual(shown, real),
             depth_l1_m=depth_l1(rendered.expected_depth, frame.depth, alpha=rendered.alpha),
         )
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from magic_core.errors import InvalidInput
-from magic_core.evaluation import depth_l1, psnr, ssim
+from magic_core.evaluation import depth_l1, ms_ssim, psnr, ssim
 from tests.core.small_flat import small_frames
 
 
@@ -29,6 +30,24 @@ def test_psnr_and_ssim_agree_with_torchmetrics(name):
     assert psnr(rendered, real) == pytest.approx(expected, abs=1e-5)
     expected = float(functional.structural_similarity_index_measure(a, b, data_range=1.0))
     assert ssim(rendered, real) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["moved", "noisy"])
+def test_ms_ssim_agrees_with_torchmetrics(name):
+    functional = pytest.importorskip("torchmetrics.functional.image")
+    import torch
+
+    rendered, real = (cv2.resize(i, (322, 241)) for i in image_pairs()[name])
+    a, b = (torch.tensor(i / 255.0).permute(2, 0, 1)[None] for i in (rendered, real))
+    expected = functional.multiscale_structural_similarity_index_measure(a, b, data_range=1.0)
+    assert ms_ssim(rendered, real) == pytest.approx(float(expected), abs=1e-5)
+
+
+def test_ms_ssim_says_nothing_of_images_too_small_for_five_scales():
+    real = small_frames(0)[0].colour
+    assert np.isnan(ms_ssim(real[:160, :160], real[:160, :160]))
+    large = cv2.resize(real, (161, 161))
+    assert ms_ssim(large, large) == pytest.approx(1.0)
 
 
 def test_equal_images_are_perfect():

@@ -152,7 +152,45 @@ def test_measures_poses_and_map(run):
         assert metrics["psnr_db"][kind] > 17  # a crude map: measured 19.6
         assert 0.35 < metrics["ssim"][kind] < 1  # measured 0.46
         assert metrics["depth_l1_m"][kind] < 0.2  # silhouettes are soft at this size
+        assert metrics["psnr_db"][f"{kind}_coarse"] is None
+    assert "map_coarse.ply" in metrics["unmeasured"]["coarse"]
     json.dumps(metrics, allow_nan=False)
+
+
+def test_the_map_before_refinement_is_measured_beside_the_final_one(run, tmp_path):
+    again = make_run(tmp_path / "both")
+    fine = run.read_map()
+    again.map_path.replace(again.coarse_map_path)
+    again.write_map(fine.select(np.arange(0, len(fine), 3)))
+    metrics = evaluate_run(again, sources=small_flat()[:2], views_per_kind=4)
+    whole = evaluate_run(run, sources=small_flat()[:2], views_per_kind=4)
+    for name in ("psnr_db", "ssim", "depth_l1_m"):
+        assert metrics[name]["train_coarse"] == pytest.approx(whole[name]["train"], rel=1e-6)
+        assert metrics[name]["novel_coarse"] == pytest.approx(whole[name]["novel"], rel=1e-6)
+    assert metrics["psnr_db"]["train"] < metrics["psnr_db"]["train_coarse"] - 0.3
+
+
+def test_agents_are_measured_one_by_one(run):
+    metrics = evaluate_run(run, sources=small_flat()[:2], views_per_kind=4)
+    agents = metrics["per_agent"]
+    assert set(agents) == {"agent_0", "agent_1"}
+    for kind in ("train", "novel"):  # two views of each kind per agent, so means of means agree
+        parts = [agents[name]["psnr_db"][kind] for name in agents]
+        assert np.mean(parts) == pytest.approx(metrics["psnr_db"][kind])
+
+
+def test_relative_errors_are_those_of_each_agents_motion(run):
+    metrics = evaluate_run(run, sources=small_flat()[:2], views_per_kind=1)
+    recorded = run.read_trajectory("agent_0", "ground_truth").timestamps_s
+    assert (set(metrics["rpe_rmse"]) == {"agent_0", "agent_1"}) == (np.ptp(recorded) >= 1.0)
+    assert all(error["translation_m"] < 1e-6 for error in metrics["rpe_rmse"].values())
+
+
+def test_without_weights_lpips_is_null_and_says_why(run, monkeypatch):
+    monkeypatch.setattr("magic_core.evaluation.lpips.find_weights", lambda given: None)
+    metrics = evaluate_run(run, sources=small_flat()[:2], views_per_kind=1)
+    assert set(metrics["lpips"].values()) == {None}
+    assert "MAGIC_LPIPS_WEIGHTS" in metrics["unmeasured"]["lpips"]
 
 
 def test_a_map_at_wrong_poses_measures_worse(run, tmp_path):
@@ -201,7 +239,9 @@ def test_a_run_without_truth_or_map_is_measured_as_far_as_possible(tmp_path):
     run = RunFolder(tmp_path / "short").create()
     metrics = evaluate_run(run, sources=[])
     assert metrics["ate_rmse_m"] == {"joint": None}
-    assert metrics["psnr_db"] == {"train": None, "novel": None}
+    assert set(metrics["psnr_db"]) == {"train", "novel", "train_coarse", "novel_coarse"}
+    assert set(metrics["psnr_db"].values()) == {None}
+    assert "map.ply" in metrics["unmeasured"]["maps"]
     write_report(run, sources=[])
     assert "<h1>short</h1>" in run.report_path.read_text()
 

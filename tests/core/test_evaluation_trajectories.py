@@ -12,6 +12,7 @@ from magic_core.evaluation import (
     joint_ate_rmse,
     read_kitti,
     read_tum,
+    relative_pose_error,
     write_kitti,
     write_tum,
 )
@@ -134,3 +135,42 @@ def test_an_empty_trajectory_is_written_and_read(tmp_path):
     empty = Trajectory.from_poses([])
     assert len(read_tum(write_tum(tmp_path / "t.txt", empty))) == 0
     assert empty.path_length_m == 0.0
+
+
+def test_relative_error_is_the_drift_over_a_second():
+    times = np.arange(90) / 30.0
+    truth = Trajectory(times, np.tile(np.eye(4), (90, 1, 1)))
+    truth.world_from_camera[:, 0, 3] = times
+    drifting = Trajectory(times, truth.world_from_camera.copy())
+    for i, time in enumerate(times):  # per second: 3 cm along x, 0.02 rad about z
+        drifting.world_from_camera[i] = se3.exp([1.03 * time, 0, 0, 0, 0, 0])
+        drifting.world_from_camera[i, :3, :3] = se3.rotation_exp([0, 0, 0.02 * time])
+    straight = Trajectory(times, drifting.world_from_camera.copy())
+    straight.world_from_camera[:, :3, :3] = np.eye(3)
+    error = relative_pose_error(straight, truth)
+    assert error.pairs == 60
+    assert error.translation_m == pytest.approx(0.03, rel=1e-6)
+    assert error.rotation_rad == pytest.approx(0.0, abs=1e-9)
+    assert relative_pose_error(drifting, truth).rotation_rad == pytest.approx(0.02, rel=1e-6)
+    halved = relative_pose_error(straight, truth, interval_s=0.5)
+    assert halved.translation_m == pytest.approx(0.015, rel=1e-6)
+
+
+def test_relative_error_does_not_depend_on_the_world_frame():
+    rng = np.random.default_rng(3)
+    times = np.arange(70) / 30.0
+    truth = Trajectory.from_poses((t, se3.exp(rng.normal(0, 0.3, 6))) for t in times)
+    ours = Trajectory.from_poses(
+        (t, pose @ se3.exp(rng.normal(0, 0.01, 6)))
+        for t, pose in zip(times, truth.world_from_camera, strict=True)
+    )
+    here = relative_pose_error(ours, truth)
+    there = relative_pose_error(ours.transformed(se3.exp([3, 2, 1, 0.3, 1.0, 2.0])), truth)
+    assert there.translation_m == pytest.approx(here.translation_m, rel=1e-9)
+    assert there.rotation_rad == pytest.approx(here.rotation_rad, rel=1e-6)
+
+
+def test_recordings_shorter_than_the_interval_have_no_relative_error():
+    short = Trajectory(np.array([0.0, 0.5]), np.tile(np.eye(4), (2, 1, 1)))
+    with pytest.raises(InvalidInput, match="1 s apart"):
+        relative_pose_error(short, short)
