@@ -136,7 +136,7 @@ class GaussianOptimiser:
         colour (h, w, 3) uint8 RGB, depth (h, w) metres with 0 = no reading, weight (h, w) of each
         pixel in all image losses (None: 1). Gaussians that are not drawn keep their values.
         """
-        _check_images(camera, colour, depth, weight)
+        check_images(camera, colour, depth, weight)
         self._rasteriser.forward(self._active(), camera, world_from_camera)
         report = self._image_losses(colour, depth, weight)
         self._rasteriser.accumulate(
@@ -259,9 +259,10 @@ class GaussianOptimiser:
             new[: k * n] = old[: k * n]
 
 
-def _check_images(
+def check_images(
     camera: Camera, colour: NDArray[np.uint8], depth: Float32, weight: Float32 | None
 ) -> None:
+    """Raise InvalidInput unless the images of a step have the camera's size and their types."""
     shape = (camera.height, camera.width)
     if colour.shape != (*shape, 3) or colour.dtype != np.uint8:
         text = f"{colour.dtype} {colour.shape}, expected uint8 {(*shape, 3)}"

@@ -6,9 +6,25 @@ import torch
 
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
-from magic_core.render import GaussianTensors, render
+from magic_core.render import GaussianTensors, Rasteriser, render
+from magic_core.render.backend import has_cuda, new_optimiser
+from magic_core.render.benchmark_scene import benchmark_scene
 
 pytestmark = pytest.mark.gpu
+
+
+def test_optimiser_on_cuda_lowers_the_loss_like_the_fused_one():
+    if not has_cuda():
+        pytest.skip("no CUDA device with gsplat")
+    cloud, camera = benchmark_scene(160, 120, 3000)
+    view = Rasteriser().render(cloud, camera, np.eye(4))
+    colour, depth = (np.clip(view.colour, 0, 1) * 255).astype(np.uint8), view.expected_depth
+    grey = GaussianCloud(*cloud.arrays()[:4], np.full_like(cloud.colours, 0.5))
+    losses = []
+    for device in ("cpu", "cuda"):
+        optimiser = new_optimiser(grey, device=device)
+        losses.append([optimiser.step(camera, np.eye(4), colour, depth).loss for _ in range(50)])
+    np.testing.assert_allclose(losses[1], losses[0], rtol=0.05)
 
 
 def test_cuda_agrees_with_the_cpu_in_image_and_gradients():
