@@ -19,6 +19,9 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 
 @dataclass(frozen=True, slots=True)
 class ListenConfig:
+from magic_server.resources import ResourceConfig
+from magic_server.tls import TlsConfig
+from magic_server.upload_config import PartialUploadLimits
     """Where the server listens."""
 
     host: str = "127.0.0.1"
@@ -63,6 +66,8 @@ class ServiceLimits:
 class ServerConfig:
     """Everything about a server."""
 
+    partial_uploads: PartialUploadLimits = field(default_factory=PartialUploadLimits)
+    """What is kept of uploads that broke off."""
     data_dir: Path = Path("magic-data")
     """Folder of the store; it is created."""
     listen: ListenConfig = field(default_factory=ListenConfig)

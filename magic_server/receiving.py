@@ -1,32 +1,49 @@
-"""Taking in one sub-map: every rule checked, every byte hashed, nothing kept of what is refused."""
+"""Taking in sub-maps: every rule checked, every byte hashed, nothing kept of what is refused.
+
+A stream that breaks is no refusal: what came of it waits on disk for the next stream.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
+import logging
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import Executor
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import submap_pb2
 
-from magic_core.errors import AlreadyExists, CorruptData, DeadlineExceeded, InvalidInput, WrongState
-from magic_core.wire import ChunkCursor, check_blob, check_chunk, check_header, geometry, names
+from magic_core.errors import (
+    AlreadyExists,
+    CorruptData,
+    DeadlineExceeded,
+    InvalidInput,
+    MagicError,
+    Unavailable,
+    WrongState,
+)
+from magic_core.wire import check_blob, check_chunk, check_header, geometry, names
 from magic_core.wire.submap import decode_odometry
 from magic_server.config import ServiceLimits
+from magic_server.quotas import Quotas
 from magic_server.store import (
     AgentRow,
-    BlobWriter,
     FirstAnswer,
     NewSubmap,
+    PartialUpload,
     Store,
+    UploadName,
     Vertex,
     require_model,
 )
 from magic_server.tasks import TaskScope
+
+logger = logging.getLogger(__name__)
 
 Messages = AsyncIterator[mapping_pb.SubmitSubmapRequest]
 
@@ -40,36 +57,81 @@ class Received:
     duplicate: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Resumption:
+    """Where an upload goes on."""
+
+    blob_index: int
+    offset: int
+    durable_bytes: int
+    stored: bool
+
+
 class SubmapReceiver:
     """Takes uploads, a bounded number at a time."""
 
-    def __init__(self, store: Store, *, threads: Executor, limits: ServiceLimits) -> None:
+    def __init__(
+        self, store: Store, *, threads: Executor, limits: ServiceLimits, quotas: Quotas
+    ) -> None:
         self._store = store
+        self._quotas = quotas
         self._threads = threads
         self._limits = limits
         self._places = asyncio.Semaphore(limits.concurrent_uploads)
-        self._commits = TaskScope("commits")
+        self._claims: dict[str, _Claim] = {}
+        self._background = TaskScope("uploads")
 
     async def close(self) -> None:
-        """Wait for commits under way, whose callers may be gone already."""
-        await self._commits.finish()
+        """Wait for what must not be interrupted, whose callers may be gone already."""
+        await self._background.finish()
 
     async def receive(
         self, messages: Messages, *, on_stored: Callable[[AgentRow, Vertex], None]
     ) -> tuple[str, Received]:
         """Take one upload; `on_stored` is called in the order in which sub-maps became durable."""
-        async with self._places:
+        async with self._places, AsyncExitStack() as room:
             header = await self._header(messages)
-            upload = await self._admitted(header)
-            if isinstance(upload, FirstAnswer):
-                return header.name, _repeated(upload)
-            try:
-                await upload.take(messages)
+            name = UploadName(header.name, header.request_id)
+            async with self._claimed(name) as claim:
+                upload = await self._admitted(header, name, room)
+                if isinstance(upload, FirstAnswer):
+                    return header.name, _repeated(upload)
+                await self._taken(upload, messages, claim)
                 # A client that goes away must not interrupt the transaction.
-                commit = self._commits.start(self._commit(upload, on_stored), name=header.name)
+                commit = self._background.start(self._commit(upload, on_stored), name=header.name)
                 return header.name, await asyncio.shield(commit)
-            finally:
-                await asyncio.shield(self._in_thread(upload.discard))
+
+    async def resumption(self, submap: str, request_id: str) -> Resumption:
+        """Where an upload goes on; a stream of it that is still open ends.
+
+        Raises NotFound for an unknown agent, AlreadyExists when another request stored the sub-map.
+        """
+        session, agent_id, index = names.parse_submap(submap, field="submap")
+        agent = await self._store.agents.agent(session, agent_id)
+        name = UploadName(submap, request_id)
+        async with self._claimed(name):
+            first = await self._store.submaps.first_answer(agent, index)
+            if first is not None:
+                _require_same_request(name, first)
+                return Resumption(0, 0, first.stored_bytes, True)
+            found = await self._in_thread(lambda: self._store.uploads.look(name, now=time.time()))
+            return Resumption(*found, stored=False)
+
+    @asynccontextmanager
+    async def _claimed(self, name: UploadName) -> AsyncIterator[_Claim]:
+        """While the block runs no other stream brings the same upload; one that does ends now.
+
+        A connection that is lost may look alive here for a minute, and its client is back at once.
+        """
+        while (other := self._claims.get(name.key)) is not None:
+            other.give_way()
+            await other.released.wait()
+        claim = self._claims[name.key] = _Claim()
+        try:
+            yield claim
+        finally:
+            del self._claims[name.key]
+            claim.released.set()
 
     async def _header(self, messages: Messages) -> submap_pb2.SubmapHeader:
         first = await next_message(messages, self._limits.upload_idle_s)
@@ -78,81 +140,193 @@ class SubmapReceiver:
         await self._in_thread(check_header, first.header, self._limits.submap)
         return first.header
 
-    async def _admitted(self, header: submap_pb2.SubmapHeader) -> Upload | FirstAnswer:
-        """The upload, or the first answer when the sub-map is stored already."""
+    async def _admitted(
+        self, header: submap_pb2.SubmapHeader, name: UploadName, room: AsyncExitStack
+    ) -> Upload | FirstAnswer:
+        """The upload, its place held by `room`; the first answer when the sub-map is stored."""
         session, agent_id, index = names.parse_submap(header.name)
         agent = await self._store.agents.agent(session, agent_id)
         digest = await self._in_thread(_digest, header)
         first = await self._store.submaps.first_answer(agent, index)
         if first is not None:
-            _require_same(header, digest, first)
+            _require_same(name, digest, first)
             return first
+        await self._require_admission(header, agent, index)
+        length = sum(blob.length for blob in header.blobs)
+        await room.enter_async_context(self._quotas.upload(agent, length, key=name.key))
+        return await self._opened(Upload(agent, header, digest, self._store))
+
+    async def _require_admission(
+        self, header: submap_pb2.SubmapHeader, agent: AgentRow, index: int
+    ) -> None:
+        """Raise unless the agent may store this sub-map now."""
+        session = agent.session.name
         if agent.finished:
-            raise WrongState(f"{names.agent_name(session, agent_id)} has finished")
+            raise WrongState(f"{names.agent_name(session, agent.name)} has finished")
+        other = await self._store.submaps.number_of_request(agent, header.request_id)
+        if other is not None:
+            raise AlreadyExists(
+                f"request {header.request_id!r} stored "
+                f"{names.submap_name(session, agent.name, other)}; each sub-map has its own id"
+            )
         vector = header.descriptor.vector
         require_model(agent.session, header.descriptor.model_id, len(vector))
         if header.HasField("odometry"):
             previous = header.odometry.previous_index
             if await self._store.submaps.first_answer(agent, previous) is None:
-                name = names.submap_name(session, agent_id, previous)
+                name = names.submap_name(session, agent.name, previous)
                 raise WrongState(f"odometry refers to {name}, which is not stored; submit it first")
-        return Upload(agent, header, digest, store=self._store, receiver=self)
+
+    async def _opened(self, upload: Upload) -> Upload:
+        try:
+            await self._whole(upload.open)
+        except asyncio.CancelledError:
+            await self._finish(self._kept(upload.partial))
+            raise
+        return upload
+
+    async def _taken(self, upload: Upload, messages: Messages, claim: _Claim) -> None:
+        """Receive what is missing. A broken stream leaves what came; a refusal leaves nothing."""
+        claim.taking = asyncio.create_task(self._take(upload, messages))
+        try:
+            await claim.taking
+        except DeadlineExceeded:
+            await self._finish(self._kept(upload.partial))
+            raise
+        except asyncio.CancelledError:
+            await self._finish(self._kept(upload.partial))
+            if claim.gave_way:
+                raise Unavailable("another stream of the same upload has taken over") from None
+            raise
+        except BaseException:
+            await self._finish(self._in_thread(upload.partial.discard))
+            raise
+
+    async def _take(self, upload: Upload, messages: Messages) -> None:
+        """Receive every chunk that is missing; raises unless all blobs are complete and right."""
+        begun = False
+        while not upload.complete or not begun:
+            message = await self._message(messages)
+            if message is None:
+                break
+            if message.WhichOneof("payload") != "chunk":
+                raise InvalidInput.field("chunk", "expected a chunk after the header")
+            await self._whole(upload.put, message.chunk, not begun)
+            begun = True
+        if not upload.complete:
+            blob, offset = upload.partial.cursor.position
+            raise InvalidInput.field(
+                "chunk", f"the upload ended early, at byte {offset} of blob {blob}"
+            )
+        if begun and await self._message(messages) is not None:
+            raise InvalidInput.field("chunk", "every blob is complete already")
+
+    async def _kept(self, upload: PartialUpload) -> None:
+        """Put an upload aside for its next stream; it is dropped where the disk refuses that."""
+        try:
+            await self._in_thread(lambda: self._store.uploads.keep(upload, now=time.time()))
+        except (MagicError, OSError):
+            logger.warning("%s: the part that came cannot be kept", upload.name.submap)
+            await self._in_thread(upload.discard)
+
+    async def _finish(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Run to the end whatever becomes of the caller."""
+        await asyncio.shield(self._background.start(work, name="tidying"))
 
     async def _commit(
         self, upload: Upload, on_stored: Callable[[AgentRow, Vertex], None]
     ) -> Received:
         now = time.time()
-        submap = await self._in_thread(upload.new_submap)
-        first = await self._store.add_submap(upload.agent, submap, upload.written, now=now)
-        if first is not None:
-            _require_same(upload.header, upload.digest, first)
-            return _repeated(first)
-        # No await in between: sub-maps are told of in the order of their transactions.
-        on_stored(upload.agent, submap.vertex)
-        return Received(now, sum(blob.length for blob in upload.header.blobs), False)
+        try:
+            submap = await self._in_thread(upload.new_submap)
+            blobs = upload.partial.blobs
+            first = await self._store.add_submap(upload.agent, submap, blobs, now=now)
+            if first is not None:
+                _require_same(upload.partial.name, upload.partial.header_sha256, first)
+                return _repeated(first)
+            # No await in between: sub-maps are told of in the order of their transactions.
+            on_stored(upload.agent, submap.vertex)
+            return Received(now, sum(blob.length for blob in upload.header.blobs), False)
+        finally:
+            await self._in_thread(upload.partial.discard)
 
     async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+    async def _whole(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Run on a thread; whoever is cancelled meanwhile waits for its end first."""
+        work = asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+        try:
+            return await asyncio.shield(work)
+        except asyncio.CancelledError:
+            await asyncio.gather(work, return_exceptions=True)
+            raise
 
     async def _message(self, messages: Messages) -> mapping_pb.SubmitSubmapRequest | None:
         return await next_message(messages, self._limits.upload_idle_s)
 
 
+class _Claim:
+    """One stream's hold on an upload."""
+
+    def __init__(self) -> None:
+        self.taking: asyncio.Task[None] | None = None
+        self.gave_way = False
+        self.released = asyncio.Event()
+
+    def give_way(self) -> None:
+        """End receiving for another stream; what is being committed is committed."""
+        if self.taking is not None and not self.taking.done():
+            self.gave_way = True
+            self.taking.cancel()
+
+
 class Upload:
-    """The blobs of one sub-map on their way in."""
+    """A checked header and its blobs on their way in. Every method blocks."""
 
     def __init__(
-        self,
-        agent: AgentRow,
-        header: submap_pb2.SubmapHeader,
-        digest: bytes,
-        *,
-        store: Store,
-        receiver: SubmapReceiver,
+        self, agent: AgentRow, header: submap_pb2.SubmapHeader, digest: bytes, store: Store
     ) -> None:
         self.agent = agent
         self.header = header
-        self.digest = digest
-        self.written: list[BlobWriter] = []
-        self._gaussian_count = 0
+        self.partial: PartialUpload
+        self._digest = digest
         self._store = store
-        self._receiver = receiver
+        self._gaussian_count = 0
 
-    async def take(self, messages: Messages) -> None:
-        """Receive every chunk; raises unless all blobs are complete and right."""
-        cursor = ChunkCursor(tuple(blob.length for blob in self.header.blobs))
-        while not cursor.done:
-            message = await self._receiver._message(messages)
-            if message is None:
-                blob, offset = cursor.position
-                raise InvalidInput.field(
-                    "chunk", f"the upload ended early, at byte {offset} of blob {blob}"
-                )
-            if message.WhichOneof("payload") != "chunk":
-                raise InvalidInput.field("chunk", "expected a chunk after the header")
-            await self._receiver._in_thread(self._put, cursor, message.chunk)
-        if await self._receiver._message(messages) is not None:
-            raise InvalidInput.field("chunk", "every blob is complete already")
+    @property
+    def complete(self) -> bool:
+        """Whether every blob has come."""
+        return self.partial.cursor.done
+
+    def open(self) -> None:
+        """Take up what is kept of this very upload, or begin."""
+        name = UploadName(self.header.name, self.header.request_id)
+        kept = self._store.uploads.take(name)
+        if kept is not None and kept.header_sha256 != self._digest:
+            kept.discard()
+            kept = None
+        if kept is None:
+            self._begin(name)
+            return
+        self.partial = kept
+        try:
+            for index in range(kept.cursor.position[0]):
+                self._check(index)
+        except MagicError:
+            logger.warning("%s: what was kept of the upload is damaged; starting over", name.submap)
+            kept.discard()
+            self._begin(name)
+
+    def put(self, chunk: submap_pb2.BlobChunk, first: bool) -> None:
+        """Check, write and hash a chunk; check the blob when it is complete."""
+        check_chunk(chunk)
+        if first and (chunk.blob_index, chunk.offset) == (0, 0) and self.partial.held_bytes:
+            self.partial.discard()
+            self._begin(self.partial.name)
+        index = self.partial.put(chunk)
+        if index is not None:
+            self._check(index)
 
     def new_submap(self) -> NewSubmap:
         """Everything for the transaction."""
@@ -171,33 +345,21 @@ class Upload:
         )
         return NewSubmap(
             header=self.header,
-            header_sha256=self.digest,
+            header_sha256=self._digest,
             gaussian_count=self._gaussian_count,
             digests=tuple(blob.sha256.hex() for blob in self.header.blobs),
             vertex=vertex,
         )
 
-    def discard(self) -> None:
-        """Remove what was not adopted by the store."""
-        for blob in self.written:
-            blob.discard()
+    def _begin(self, name: UploadName) -> None:
+        self._gaussian_count = 0
+        self.partial = self._store.uploads.begin(name, self.header, self._digest)
 
-    def _put(self, cursor: ChunkCursor, chunk: submap_pb2.BlobChunk) -> None:
-        """Check, write and hash a chunk; check the blob when it is complete."""
-        check_chunk(chunk)
-        index, offset = cursor.position
-        complete = cursor.advance(chunk)
-        if offset == 0:
-            self.written.append(self._store.blobs.writer())
-        self.written[index].write(chunk.data)
-        if complete:
-            self._complete(index)
-
-    def _complete(self, index: int) -> None:
-        blob = self.written[index]
+    def _check(self, index: int) -> None:
+        """Raise unless a complete blob is what the header says."""
+        blob = self.partial.blobs[index]
         if blob.sha256 != self.header.blobs[index].sha256.hex():
             raise CorruptData(f"blobs[{index}]: its SHA-256 is not the header's; send it again")
-        blob.finish()
         self._gaussian_count += check_blob(self.header, index, blob.path.read_bytes())
 
 
@@ -214,13 +376,17 @@ def _digest(header: submap_pb2.SubmapHeader) -> bytes:
     return hashlib.sha256(header.SerializeToString(deterministic=True)).digest()
 
 
-def _require_same(header: submap_pb2.SubmapHeader, digest: bytes, first: FirstAnswer) -> None:
-    if first.request_id != header.request_id:
-        raise AlreadyExists(f"{header.name} is stored already, by another request")
+def _require_same(name: UploadName, digest: bytes, first: FirstAnswer) -> None:
+    _require_same_request(name, first)
     if first.header_sha256 != digest:
         raise AlreadyExists(
-            f"{header.name} is stored already; request {header.request_id!r} had other content"
+            f"{name.submap} is stored already; request {name.request_id!r} had other content"
         )
+
+
+def _require_same_request(name: UploadName, first: FirstAnswer) -> None:
+    if first.request_id != name.request_id:
+        raise AlreadyExists(f"{name.submap} is stored already, by another request")
 
 
 def _repeated(first: FirstAnswer) -> Received:

@@ -55,8 +55,13 @@ class Server:
         self.port = 0
         threads = config.limits.io_threads
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix="magic-io")
-        self._jobs = ProcessExecutor(config.jobs)
-        self._store = Store(config.data_dir, self._threads)
+        self.metrics = Metrics()
+        self._jobs = ProcessExecutor(
+            config.jobs, trace=config.tracing, observer=self.metrics.job_done
+        )
+        self._store = Store(
+            config.data_dir, self._threads, partial_uploads=config.limits.partial_uploads
+        )
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
         self.sessions = Sessions(self._store, **shared)
         self._maps = GlobalMaps(self._store, self.sessions, **shared)

@@ -12,14 +12,9 @@ from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magic_agent.client.connection import Connection, new_id
 from magic_core.errors import DeadlineExceeded
 from magic_core.geometry import Camera
-from magic_core.submap import Descriptor, Submap
+from magic_core.submap import Descriptor
 from magic_core.wire import (
-    MAX_CHUNK_BYTES,
-    EncodedSubmap,
-    SubmapEncoding,
-    chunks_of,
     convert,
-    encode_submap,
     error_of,
     geometry,
     images,
@@ -61,43 +56,10 @@ class MappingCalls(Connection):
             max_chunk_bytes=answer.max_chunk_bytes,
         )
 
-    async def submit_submap(
-        self, submap: Submap, *, lossless: bool = False, request_id: str | None = None
-    ) -> records.SubmapReceipt:
-        """Send a finished sub-map; returns once it is durable on the server.
-
-        The sub-map is encoded on a thread. `request_id` defaults to the sub-map's name, so that a
-        repeat after a crash is recognised.
-        """
-        encoding = SubmapEncoding.lossless() if lossless else self.config.encoding
-        request_id = request_id or submap.name
-        encoded = await asyncio.to_thread(
-            encode_submap, submap, request_id=request_id, encoding=encoding
-        )
-        return await self.submit_encoded(encoded)
-
-    async def submit_encoded(self, encoded: EncodedSubmap) -> records.SubmapReceipt:
-        """Send a sub-map that is bytes already, for example from a spool."""
-
-        async def attempt() -> mapping_pb.SubmitSubmapResponse:
-            call = self.mapping_stub.SubmitSubmap(
-                _upload(encoded), timeout=self.config.submit_timeout_s
-            )
-            return await call
-
-        answer = await self.retried(attempt)
-        return records.SubmapReceipt(
-            submap=answer.submap,
-            received_at=convert.timestamp_from_proto(answer.received_at),
-            stored_bytes=answer.stored_bytes,
-            duplicate=answer.duplicate,
-            wire_bytes=encoded.wire_bytes,
-        )
-
-    async def finish_agent(self, session: str, agent: str) -> int:
+    async def finish_agent(self, session: str, agent: str, *, request_id: str | None = None) -> int:
         """Say that an agent will send no more; returns its number of stored sub-maps."""
         request = mapping_pb.FinishAgentRequest(
-            agent=names.agent_name(session, agent), request_id=new_id()
+            agent=names.agent_name(session, agent), request_id=request_id or new_id()
         )
         return (await self.idempotent(self.mapping_stub.FinishAgent, request)).submap_count
 
@@ -219,13 +181,6 @@ class MappingCalls(Connection):
             self.mapping_stub.Localize, request, timeout_s=self.config.localize_timeout_s
         )
         return convert.localization_from_proto(answer)
-
-
-async def _upload(encoded: EncodedSubmap) -> AsyncIterator[mapping_pb.SubmitSubmapRequest]:
-    yield mapping_pb.SubmitSubmapRequest(header=encoded.header)
-    for index, blob in enumerate(encoded.blobs):
-        for chunk in chunks_of(blob, blob_index=index, chunk_bytes=MAX_CHUNK_BYTES):
-            yield mapping_pb.SubmitSubmapRequest(chunk=chunk)
 
 
 def _agent_or_empty(session: str, agent: str | None) -> str:

@@ -14,10 +14,10 @@ MAX_CHUNK_BYTES = 1 << 20
 
 
 def chunks_of(
-    data: bytes, *, blob_index: int = 0, chunk_bytes: int = MAX_CHUNK_BYTES
+    data: bytes, *, blob_index: int = 0, chunk_bytes: int = MAX_CHUNK_BYTES, begin: int = 0
 ) -> Iterator[submap_pb2.BlobChunk]:
-    """A blob as chunk messages in order, each with its offset and CRC-32."""
-    for offset in range(0, len(data), chunk_bytes):
+    """A blob, from byte `begin` on, as chunk messages in order, each with offset and CRC-32."""
+    for offset in range(begin, len(data), chunk_bytes):
         piece = data[offset : offset + chunk_bytes]
         yield submap_pb2.BlobChunk(
             blob_index=blob_index, offset=offset, data=piece, crc32=zlib.crc32(piece)

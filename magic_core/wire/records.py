@@ -45,6 +45,19 @@ class SubmapReceipt:
 
 
 @dataclass(frozen=True, slots=True)
+class UploadPosition:
+    """Where an upload that broke off goes on."""
+
+    blob_index: int
+    offset: int
+    """Position within that blob, bytes."""
+    durable_bytes: int
+    """Bytes of all blobs that the server has on its disk."""
+    stored: bool
+    """True when the sub-map is stored already: the header alone gets the first answer."""
+
+
+@dataclass(frozen=True, slots=True)
 class LoopCandidate:
     """Two sub-maps that may show the same place, and what became of it."""
 

@@ -18,6 +18,7 @@ from magicslam.v1 import submap_pb2
 from magic_core.errors import MagicError
 from magic_core.geometry import Camera
 from magic_core.wire import decode_submap, geometry, images
+from magic_server.store.blobs import read_checked
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
@@ -191,12 +192,12 @@ def _images(
     message = header.keyframes[keyframe]
     size = (header.camera.width, header.camera.height)
     colour = images.decode_colour(
-        stored.blobs[message.colour_blob].read_bytes(),
+        read_checked(stored.blobs[message.colour_blob]),
         header.blobs[message.colour_blob].media_type,
         size=size,
     )
     depth = images.decode_depth(
-        stored.blobs[message.depth_blob].read_bytes(),
+        read_checked(stored.blobs[message.depth_blob]),
         metres_per_unit=header.blobs[message.depth_blob].metres_per_unit,
         size=size,
     )
@@ -205,7 +206,7 @@ def _images(
 
 def _read_submap(stored: StoredSubmap):
     header = submap_pb2.SubmapHeader.FromString(stored.header)
-    return decode_submap(header, [path.read_bytes() for path in stored.blobs])
+    return decode_submap(header, [read_checked(path) for path in stored.blobs])
 
 
 def _progress_writer(path: Path) -> Callable[[float, str], None]:

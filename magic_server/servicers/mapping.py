@@ -23,7 +23,7 @@ from magic_server.localizing import Localizer
 from magic_server.receiving import SubmapReceiver
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.sessions import Sessions
-from magic_server.store import Store, require_model
+from magic_server.store import Asked, Store, require_model
 
 Context = grpc.aio.ServicerContext
 MAX_WAIT_S = 60.0
@@ -59,14 +59,14 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             agent,
             model_id=request.descriptor_model_id,
             dimension=request.descriptor_dimension,
-            now=time.time(),
+            asked=asked,
         )
-        coordinator = await self._sessions.coordinator(row.session)
+        await self._sessions.coordinator(entered.agent.session)
         return mapping_pb.RegisterAgentResponse(
             agent=request.agent,
-            next_submap_index=await self._store.agents.next_submap_index(row),
-            resumed=resumed,
-            revision=coordinator.board.revision,
+            next_submap_index=entered.next_submap_index,
+            resumed=entered.resumed,
+            revision=entered.revision,
             max_submap_bytes=self._config.limits.submap.max_bytes,
             max_chunk_bytes=MAX_CHUNK_BYTES,
         )
@@ -91,7 +91,21 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
     ) -> mapping_pb.FinishAgentResponse:
         session, agent = names.parse_agent(request.agent, field="agent")
         check_request_id(request.request_id)
-        count = await self._store.agents.finish(session, agent, now=time.time())
+    async def ResumeUpload(  # noqa: N802
+        self, request: mapping_pb.ResumeUploadRequest, context: Context
+    ) -> mapping_pb.ResumeUploadResponse:
+        check_request_id(request.request_id)
+        found = await self._receiver.resumption(request.submap, request.request_id)
+        return mapping_pb.ResumeUploadResponse(
+            submap=request.submap,
+            blob_index=found.blob_index,
+            offset=found.offset,
+            durable_bytes=found.durable_bytes,
+            stored=found.stored,
+        )
+
+        asked = Asked.of(request, request_id=request.request_id, now=time.time())
+        count = await self._store.agents.finish(session, agent, asked=asked)
         return mapping_pb.FinishAgentResponse(agent=request.agent, submap_count=count)
 
     async def QueryLoops(  # noqa: N802

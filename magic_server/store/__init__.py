@@ -1,6 +1,7 @@
 """What a server remembers: SQLite beside a content-addressed blob folder."""
 
-from magic_server.store.agents import require_model
+from magic_server.store.agents import Registration, require_model
+from magic_server.store.answers import Asked
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
 from magic_server.store.maps import NewMap, OpenOperation
@@ -15,9 +16,11 @@ from magic_server.store.rows import (
 )
 from magic_server.store.store import Store
 from magic_server.store.submaps import FirstAnswer
+from magic_server.store.uploads import PartialUpload, UploadFolder, UploadName
 
 __all__ = [
     "AgentRow",
+    "Asked",
     "BlobFolder",
     "BlobWriter",
     "Deleted",
@@ -28,10 +31,14 @@ __all__ = [
     "NewSolution",
     "NewSubmap",
     "OpenOperation",
+    "PartialUpload",
+    "Registration",
     "RemovedSubmap",
     "SessionRow",
     "Store",
     "StoredSubmap",
+    "UploadFolder",
+    "UploadName",
     "Vertex",
     "require_model",
 ]

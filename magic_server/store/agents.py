@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import sqlalchemy as sa
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -10,9 +11,23 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from magic_core.errors import DescriptorModelMismatch, NotFound, WrongState
 from magic_core.wire import names, records
 from magic_core.wire.convert import moment
+from magic_server.store import answers
+from magic_server.store.answers import Asked
 from magic_server.store.database import Database
 from magic_server.store.rows import AgentRow, SessionRow
 from magic_server.store.schema import agents, loops, removed_submaps, sessions, snapshots, submaps
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """What an agent is told when it enters a session."""
+
+    agent: AgentRow
+    resumed: bool
+    """It was there before."""
+    next_submap_index: int
+    revision: int
+    """Of the session's pose graph."""
 
 
 class AgentTable:
@@ -22,37 +37,51 @@ class AgentTable:
         self._database = database
 
     async def register(
-        self, session: str, agent: str, *, model_id: str, dimension: int, now: float
-    ) -> tuple[AgentRow, bool]:
-        """The agent, and whether it was there before.
+        self, session: str, agent: str, *, model_id: str, dimension: int, asked: Asked
+    ) -> Registration:
+        """Enter an agent into a session; a repeat of the request gets the first answer.
 
         Raises DescriptorModelMismatch when the session is pinned to another encoder, WrongState
-        when the agent has finished.
+        when the agent has finished, AlreadyExists when the request id was used for another request.
         """
         async with self._database.write() as connection:
             pinned = await _pinned_session(
-                connection, session, model_id=model_id, dimension=dimension, now=now
+                connection, session, model_id=model_id, dimension=dimension, now=asked.now
             )
             found = await _find_agent(connection, pinned, agent)
+            resumed = found is not None
             if found is None:
                 values = {"session_id": pinned.id, "name": agent, "finished": False}
-                values |= {"registered_at": now, "last_seen_at": now}
+                values |= {"registered_at": asked.now, "last_seen_at": asked.now}
                 added = await connection.execute(sa.insert(agents), values)
-                return AgentRow(_new_id(added), pinned, agent, False), False
+                found = AgentRow(_new_id(added), pinned, agent, False)
+            elif (first := await answers.first_answer(connection, found.id, asked)) is not None:
+                return Registration(found, **first)
             if found.finished:
                 name = names.agent_name(session, agent)
                 raise WrongState(f"{name} has finished; register under another agent name")
-            await _touch(connection, found.id, now)
-            return found, True
+            await _touch(connection, found.id, asked.now)
+            revision = sa.select(snapshots.c.revision).where(snapshots.c.session_id == pinned.id)
+            answer = {
+                "resumed": resumed,
+                "next_submap_index": await _next_submap_index(connection, found.id),
+                "revision": await connection.scalar(revision) or 0,
+            }
+            await answers.remember(connection, found.id, asked, answer)
+            return Registration(found, **answer)
 
-    async def finish(self, session: str, agent: str, *, now: float) -> int:
-        """Mark an agent as done; returns its number of sub-maps. Idempotent."""
+    async def finish(self, session: str, agent: str, *, asked: Asked) -> int:
+        """Mark an agent as done; returns its number of sub-maps. A repeat gets the first answer."""
         found = await self.agent(session, agent)
         async with self._database.write() as connection:
+            if (first := await answers.first_answer(connection, found.id, asked)) is not None:
+                return first["submap_count"]
             change = sa.update(agents).where(agents.c.id == found.id)
-            await connection.execute(change.values(finished=True, last_seen_at=now))
+            await connection.execute(change.values(finished=True, last_seen_at=asked.now))
             count = sa.select(sa.func.count()).where(submaps.c.agent_id == found.id)
-            return await connection.scalar(count) or 0
+            answer = {"submap_count": await connection.scalar(count) or 0}
+            await answers.remember(connection, found.id, asked, answer)
+            return answer["submap_count"]
 
     async def session(self, session: str) -> SessionRow:
         """A session; NotFound when there is none of that name."""
@@ -84,12 +113,6 @@ class AgentTable:
         async with self._database.read() as connection:
             rows = await connection.execute(sa.select(sessions).order_by(sessions.c.id))
             return [SessionRow(r.id, r.name, r.model_id, r.dimension) for r in rows]
-
-    async def next_submap_index(self, agent: AgentRow) -> int:
-        """One more than the agent's last sub-map, deleted ones included."""
-        async with self._database.read() as connection:
-            last = sa.select(_last_number(agent.id))
-            return (await connection.execute(last)).scalar_one() + 1
 
     async def session_page(
         self, *, after: int = 0, limit: int = 100, session: str | None = None
@@ -172,6 +195,11 @@ async def _find_agent(
     query = sa.select(agents).where(agents.c.session_id == session.id, agents.c.name == agent)
     row = (await connection.execute(query)).one_or_none()
     return None if row is None else AgentRow(row.id, session, row.name, row.finished)
+
+
+async def _next_submap_index(connection: AsyncConnection, agent_id: int) -> int:
+    """One more than the agent's last sub-map, deleted ones included."""
+    return (await connection.execute(sa.select(_last_number(agent_id)))).scalar_one() + 1
 
 
 async def _touch(connection: AsyncConnection, agent_id: int, now: float) -> None:

@@ -1,13 +1,14 @@
 """The blob folder: content-addressed files, whole and on disk before anything refers to them.
 
     blobs/{first hex digit}/{sha256 in hex}   complete, never changed
-    incoming/                                 being written; emptied at every start
+    incoming/                                 maps being written; emptied at every start
 
 Every method blocks: call them on a thread.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -46,16 +47,21 @@ class BlobFolder:
         return BlobWriter(self.incoming)
 
     def adopt(self, written: Iterable[BlobWriter]) -> list[str]:
-        """Move complete blobs to their places, durably; returns the digests that are new."""
+        """Move complete blobs to their places, durably; returns the digests that are new.
+
+        A stored file with other content than its name says is replaced: it was damaged.
+        """
         fresh, folders = [], set()
         for blob in written:
             place = self.path(blob.sha256)
-            if place.exists():
+            folders.add(place.parent)
+            known = place.exists()
+            if known and _digest_of(place) == blob.sha256:
                 blob.discard()
                 continue
             os.replace(blob.path, place)
-            folders.add(place.parent)
-            fresh.append(blob.sha256)
+            if not known:
+                fresh.append(blob.sha256)
         for folder in folders:
             sync_folder(folder)
         return fresh
@@ -77,13 +83,7 @@ class BlobFolder:
 
     def read(self, sha256: str) -> bytes:
         """A blob's bytes, checked against its name."""
-        try:
-            data = self.path(sha256).read_bytes()
-        except FileNotFoundError:
-            raise NotFound(f"blob {sha256} is missing from {self.blobs}") from None
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise CorruptData(f"blob {sha256} in {self.blobs} does not match its name")
-        return data
+        return read_checked(self.path(sha256))
 
     def read_piece(self, sha256: str, offset: int, length: int = _READ_BYTES) -> bytes:
         """At most `length` bytes from `offset`; empty at the end."""
@@ -96,13 +96,18 @@ class BlobFolder:
 
 
 class BlobWriter:
-    """A blob that is being written in the folder of incoming files."""
+    """A blob that is being written."""
 
-    def __init__(self, folder: Path) -> None:
-        descriptor, name = tempfile.mkstemp(dir=folder)
-        self.path = Path(name)
+    def __init__(self, folder: Path, *, name: str | None = None) -> None:
+        """A new file in `folder`; with `name` that file, whose content `note` has to be told."""
+        if name is None:
+            descriptor, path = tempfile.mkstemp(dir=folder)
+            self.path = Path(path)
+            self._file = os.fdopen(descriptor, "wb")
+        else:
+            self.path = folder / name
+            self._file = self.path.open("ab")
         self.length = 0
-        self._file = os.fdopen(descriptor, "wb")
         self._digest = hashlib.sha256()
 
     @property
@@ -114,19 +119,41 @@ class BlobWriter:
         """Append bytes; DiskFull when there is no room."""
         with translated_disk_errors():
             self._file.write(data)
+        self.note(data)
+
+    def note(self, data: bytes) -> None:
+        """Count bytes that the file holds already."""
         self._digest.update(data)
         self.length += len(data)
 
-    def finish(self) -> None:
-        """Everything to the disk; nothing can be appended afterwards."""
+    def flush(self) -> None:
+        """Hand what was written to the operating system: it survives this process."""
+        with translated_disk_errors():
+            self._file.flush()
+
+    def sync(self) -> None:
+        """What was written to the disk: it survives a loss of power."""
         with translated_disk_errors():
             self._file.flush()
             os.fsync(self._file.fileno())
+
+    def finish(self) -> None:
+        """Everything to the disk; nothing can be appended afterwards."""
+        self.sync()
+        self._file.close()
+
+    def close(self) -> None:
+        """Close the file, whatever state it is in."""
+        with contextlib.suppress(OSError):  # a full disk refuses what is buffered once more
             self._file.close()
+
+    def reopen(self) -> None:
+        """Append again to a file that was closed."""
+        self._file = self.path.open("ab")
 
     def discard(self) -> None:
         """Remove the file, whatever state it is in."""
-        self._file.close()
+        self.close()
         self.path.unlink(missing_ok=True)
 
 
@@ -142,9 +169,38 @@ class translated_disk_errors:  # noqa: N801  # a context manager reads as a verb
             raise DiskFull(message, retry_after_s=DISK_RETRY_S) from error
 
 
+def read_checked(path: Path) -> bytes:
+    """The bytes of a stored blob. NotFound without it, CorruptData when it is not what it was."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise NotFound(f"the stored file {path} is missing; restore it from a backup") from None
+    if hashlib.sha256(data).hexdigest() != path.name:
+        raise CorruptData(damage(path))
+    return data
+
+
+def damage(path: Path) -> str:
+    """What is wrong with a stored file that does not match its name, and what helps."""
+    return (
+        f"the stored file {path} is damaged: its SHA-256 is not its name; restore it from a "
+        "backup, or delete the sub-map or map that it belongs to"
+    )
+
+
+def _digest_of(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names in a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
+    sync_file(folder)
+
+
+def sync_file(path: Path) -> None:
+    """Make what was written to a file or folder durable."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

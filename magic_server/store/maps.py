@@ -8,7 +8,7 @@ import sqlalchemy as sa
 from magicslam.v1 import global_map_service_pb2 as map_pb
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import MagicError, NotFound, WrongState
+from magic_core.errors import AlreadyExists, MagicError, NotFound, WrongState
 from magic_core.wire import names, records
 from magic_core.wire.convert import moment
 from magic_server.store.database import Database
@@ -45,14 +45,22 @@ class MapTable:
     async def begin(
         self, session: SessionRow, request: map_pb.BuildGlobalMapRequest, *, now: float
     ) -> tuple[int, bool]:
-        """The operation of a request, and whether it is new: a repeat finds the first one."""
-        same = sa.select(operations.c.id).where(
+        """The operation of a request, and whether it is new: a repeat finds the first one.
+
+        Raises AlreadyExists when the request id was used to ask for another map.
+        """
+        same = sa.select(operations.c.id, operations.c.request).where(
             operations.c.session_id == session.id, operations.c.request_id == request.request_id
         )
         async with self._database.write() as connection:
-            found = await connection.scalar(same)
+            found = (await connection.execute(same)).one_or_none()
             if found is not None:
-                return found, False
+                if map_pb.BuildGlobalMapRequest.FromString(found.request) != request:
+                    raise AlreadyExists(
+                        f"request_id {request.request_id!r} was used to build another map; "
+                        "give each request an id of its own"
+                    )
+                return found.id, False
             values = {
                 "session_id": session.id,
                 "request_id": request.request_id,

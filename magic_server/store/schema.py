@@ -91,6 +91,19 @@ deletions = sa.Table(
     sa.Column("deleted_at", sa.Float, nullable=False),
 )
 
+# First answers of RegisterAgent and FinishAgent (answers.py).
+answers = sa.Table(
+    "answers",
+    metadata,
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("agent_id", sa.ForeignKey("agents.id"), nullable=False),
+    sa.Column("request_id", sa.String(128), nullable=False),
+    sa.Column("request_sha256", sa.LargeBinary(32), nullable=False),
+    sa.Column("answer", sa.String, nullable=False),  # JSON
+    sa.Column("answered_at", sa.Float, nullable=False),
+    sa.UniqueConstraint("agent_id", "request_id"),
+)
+
 submap_blobs = sa.Table(
     "submap_blobs",
     metadata,

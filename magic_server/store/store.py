@@ -10,6 +10,7 @@ import asyncio
 import fcntl
 import logging
 import os
+import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -34,13 +35,21 @@ logger = logging.getLogger(__name__)
 class Store:
     """Everything a server remembers, under one folder."""
 
-    def __init__(self, folder: Path, threads: Executor) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        threads: Executor,
+        *,
+        partial_uploads: PartialUploadLimits | None = None,
+    ) -> None:
         self.folder = folder
         self.blobs = BlobFolder(folder)
         self._threads = threads
         self._database = Database(folder / "magic.sqlite")
         self._commit_lock = asyncio.Lock()
+        self.uploads = UploadFolder(folder)
         self._lock_file: int | None = None
+        self._partial_uploads = partial_uploads or PartialUploadLimits()
         self.agents = AgentTable(self._database)
         self.submaps = SubmapTable(self._database, self.blobs)
         self.loops = LoopTable(self._database)
@@ -64,7 +73,7 @@ class Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock_file = _locked(self.folder)
         loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._threads, self.blobs.open)
+        await loop.run_in_executor(self._threads, self._open_folders)
         await self._database.open()
         removed = await self.collect_orphans()
         if removed:
@@ -74,6 +83,10 @@ class Store:
         """Close the database and give the folder free."""
         await self._database.close()
         if self._lock_file is not None:
+    def _open_folders(self) -> None:
+        self.blobs.open()
+        self.uploads.open(self._partial_uploads, now=time.time())
+
             os.close(self._lock_file)
             self._lock_file = None
 

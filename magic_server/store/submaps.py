@@ -89,6 +89,16 @@ class SubmapTable:
                     return FirstAnswer(*row)
         return None
 
+    async def number_of_request(self, agent: AgentRow, request_id: str) -> int | None:
+        """The index of the sub-map, deleted or not, that an agent's request stored, or None."""
+        async with self._database.read() as connection:
+            for table in (submaps, removed_submaps):
+                mine = sa.and_(table.c.agent_id == agent.id, table.c.request_id == request_id)
+                found = await connection.scalar(sa.select(table.c.number).where(mine))
+                if found is not None:
+                    return found
+        return None
+
     async def stored(self, session: SessionRow, agent: str, index: int) -> StoredSubmap:
         """A sub-map's header and blob paths; NotFound when it is not stored."""
         name = names.submap_name(session.name, agent, index)

@@ -82,7 +82,7 @@ async def send(server: Server, sent: list[mapping_pb.SubmitSubmapRequest]) -> st
 
 
 def files_in(server: Server) -> list[Path]:
-    """Every file of the blob folder, finished or not."""
+    """Every stored file, finished or not."""
     root = server.config.data_dir
     folders = (root / "blobs", root / "incoming")
     return [file for folder in folders for file in folder.rglob("*") if file.is_file()]
@@ -124,6 +124,14 @@ async def test_concurrent_repeats_store_one_submap(registered: MagicClient, serv
     assert len({receipt.received_at for receipt in receipts}) == 1
     assert len(await registered.list_submaps("room")) == 1
     assert list((server.config.data_dir / "incoming").iterdir()) == []
+
+
+async def test_a_request_id_brings_one_submap(registered: MagicClient, server: Server) -> None:
+    await registered.submit_submap(make_submap(), request_id="first")
+    with pytest.raises(AlreadyExists, match=r"request .first. stored .*submaps/0"):
+        await registered.submit_submap(make_submap(index=1), request_id="first")
+    assert len(await registered.list_submaps("room")) == 1
+    assert list((server.config.data_dir / "uploads").iterdir()) == []
 
 
 async def test_another_request_for_a_stored_submap_is_refused(registered: MagicClient) -> None:
@@ -302,7 +310,7 @@ async def test_a_damaged_upload_is_refused_and_leaves_nothing(
     await assert_nothing_is_left(server, registered)
 
 
-async def test_a_client_that_goes_away_leaves_nothing(
+async def test_a_client_that_goes_away_leaves_nothing_but_what_it_can_go_on_with(
     registered: MagicClient, server: Server
 ) -> None:
     sent = messages(encoded())
@@ -317,10 +325,11 @@ async def test_a_client_that_goes_away_leaves_nothing(
     async with grpc.aio.insecure_channel(server.address) as channel:
         call = mapping_grpc.MappingServiceStub(channel).SubmitSubmap(stream())
         await half.wait()
-        await eventually(lambda: files_in(server))
+        await eventually(lambda: any((server.config.data_dir / "uploads").iterdir()))
         call.cancel()
-    await eventually(lambda: not files_in(server))
     await assert_nothing_is_left(server, registered)
+    await registered.submit_encoded(encoded())
+    assert list((server.config.data_dir / "uploads").iterdir()) == []
 
 
 async def test_a_submap_beyond_the_servers_limit_is_refused(

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import hashlib
 import os
+import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,7 +18,7 @@ from magic_core.errors import CorruptData, NotFound, ResourceExhausted, WrongSta
 from magic_core.submap import Submap
 from magic_core.wire import encode_submap
 from magic_core.wire.submap import decode_odometry
-from magic_server.store import BlobFolder, BlobWriter, NewSubmap, Store, Vertex
+from magic_server.store import Asked, BlobFolder, BlobWriter, NewSubmap, Store, Vertex
 from magic_server.store.blobs import translated_disk_errors
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
@@ -55,10 +56,11 @@ def new_submap(submap: Submap, store: Store) -> tuple[NewSubmap, list[BlobWriter
 
 
 async def registered(store: Store, agent: str = "agent_0"):
-    row, _ = await store.agents.register(
-        "room", agent, model_id=MODEL_ID, dimension=DIMENSION, now=1.0
+    asked = Asked(uuid.uuid4().hex, bytes(32), 1.0)
+    entered = await store.agents.register(
+        "room", agent, model_id=MODEL_ID, dimension=DIMENSION, asked=asked
     )
-    return row
+    return entered.agent
 
 
 def test_a_blob_is_named_by_its_content_and_checked_when_read(tmp_path: Path) -> None:

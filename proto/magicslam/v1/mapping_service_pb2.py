@@ -27,15 +27,15 @@ from magicslam.v1 import geometry_pb2 as magicslam_dot_v1_dot_geometry__pb2
 from magicslam.v1 import submap_pb2 as magicslam_dot_v1_dot_submap__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"magicslam/v1/mapping_service.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1bmagicslam/v1/geometry.proto\x1a\x19magicslam/v1/submap.proto\"t\n\x14RegisterAgentRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\x1b\n\x13\x64\x65scriptor_model_id\x18\x03 \x01(\t\x12\x1c\n\x14\x64\x65scriptor_dimension\x18\x04 \x01(\r\"\x97\x01\n\x15RegisterAgentResponse\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x19\n\x11next_submap_index\x18\x02 \x01(\r\x12\x0f\n\x07resumed\x18\x03 \x01(\x08\x12\x10\n\x08revision\x18\x04 \x01(\x04\x12\x18\n\x10max_submap_bytes\x18\x05 \x01(\x04\x12\x17\n\x0fmax_chunk_bytes\x18\x06 \x01(\r\"x\n\x13SubmitSubmapRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeaderH\x00\x12(\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x17.magicslam.v1.BlobChunkH\x00\x42\t\n\x07payload\"\x80\x01\n\x14SubmitSubmapResponse\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0cstored_bytes\x18\x03 \x01(\x04\x12\x11\n\tduplicate\x18\x04 \x01(\x08\"7\n\x12\x46inishAgentRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\":\n\x13\x46inishAgentResponse\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x14\n\x0csubmap_count\x18\x02 \x01(\r\"\xad\x02\n\rLoopCandidate\x12\x0e\n\x06source\x18\x01 \x01(\t\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x12\n\nsimilarity\x18\x03 \x01(\x01\x12*\n\x07verdict\x18\x04 \x01(\x0e\x32\x19.magicslam.v1.LoopVerdict\x12\x0e\n\x06reason\x18\x05 \x01(\t\x12.\n\x12target_from_source\x18\x06 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0binformation\x18\x07 \x03(\x01\x12\x0f\n\x07\x66itness\x18\x08 \x01(\x01\x12\x0e\n\x06rmse_m\x18\t \x01(\x01\x12\x0f\n\x07inliers\x18\n \x01(\r\x12\x0f\n\x07overlap\x18\x0b \x01(\x01\x12\x16\n\x0everify_seconds\x18\x0c \x01(\x01\x12\x0c\n\x04kept\x18\r \x01(\x08\"\x9f\x01\n\x11QueryLoopsRequest\x12\x10\n\x06submap\x18\x01 \x01(\tH\x00\x12.\n\ndescriptor\x18\x02 \x01(\x0b\x32\x18.magicslam.v1.DescriptorH\x00\x12\x0f\n\x07session\x18\x03 \x01(\t\x12\x16\n\x0emax_candidates\x18\x04 \x01(\r\x12\x16\n\x0emin_similarity\x18\x05 \x01(\x01\x42\x07\n\x05query\"W\n\x12QueryLoopsResponse\x12/\n\ncandidates\x18\x01 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12\x10\n\x08revision\x18\x02 \x01(\x04\"J\n\x10ListLoopsRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"o\n\x11ListLoopsResponse\x12/\n\ncandidates\x18\x01 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\"a\n\rCorrectedPose\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12-\n\x11world_from_anchor\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\"=\n\tComponent\x12\n\n\x02id\x18\x01 \x01(\t\x12\x14\n\x0csubmap_count\x18\x02 \x01(\r\x12\x0e\n\x06\x61gents\x18\x03 \x03(\t\"\xe1\x01\n\x0cPoseSnapshot\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x10\n\x08revision\x18\x02 \x01(\x04\x12-\n\tsolved_at\x18\x03 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12*\n\x05poses\x18\x04 \x03(\x0b\x32\x1b.magicslam.v1.CorrectedPose\x12+\n\ncomponents\x18\x05 \x03(\x0b\x32\x17.magicslam.v1.Component\x12\x12\n\nloop_count\x18\x06 \x01(\r\x12\x12\n\nloops_kept\x18\x07 \x01(\r\":\n\x18GetCorrectedPosesRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\r\n\x05\x61gent\x18\x02 \x01(\t\"I\n\x19GetCorrectedPosesResponse\x12,\n\x08snapshot\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\"T\n\x1aWatchCorrectedPosesRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\r\n\x05\x61gent\x18\x02 \x01(\t\x12\x16\n\x0e\x61\x66ter_revision\x18\x03 \x01(\x04\"K\n\x1bWatchCorrectedPosesResponse\x12,\n\x08snapshot\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\"5\n\x14GetTrajectoryRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x0e\n\x06wait_s\x18\x02 \x01(\x01\"w\n\x0e\x43orrectedFrame\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12-\n\x11world_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0c\n\x04lost\x18\x04 \x01(\x08\"z\n\x15GetTrajectoryResponse\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\x12,\n\x06\x66rames\x18\x04 \x03(\x0b\x32\x1c.magicslam.v1.CorrectedFrame\"\xcd\x01\n\x0fLocalizeRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12$\n\x06\x63\x61mera\x18\x02 \x01(\x0b\x32\x14.magicslam.v1.Camera\x12\x0e\n\x06\x63olour\x18\x03 \x01(\x0c\x12\x19\n\x11\x63olour_media_type\x18\x04 \x01(\t\x12\x11\n\tdepth_png\x18\x05 \x01(\x0c\x12\x17\n\x0fmetres_per_unit\x18\x06 \x01(\x01\x12,\n\ndescriptor\x18\x07 \x01(\x0b\x32\x18.magicslam.v1.Descriptor\"\xa6\x02\n\x10LocalizeResponse\x12-\n\x11world_from_camera\x18\x01 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\x12\x0e\n\x06submap\x18\x04 \x01(\t\x12.\n\x12\x61nchor_from_camera\x18\x05 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0f\n\x07\x66itness\x18\x06 \x01(\x01\x12\x0e\n\x06rmse_m\x18\x07 \x01(\x01\x12\x0f\n\x07inliers\x18\x08 \x01(\r\x12\x0f\n\x07overlap\x18\t \x01(\x01\x12\x12\n\nsimilarity\x18\n \x01(\x01\x12\x12\n\nconfidence\x18\x0b \x01(\x01\x12\x13\n\x0binformation\x18\x0c \x03(\x01*{\n\x0bLoopVerdict\x12\x1c\n\x18LOOP_VERDICT_UNSPECIFIED\x10\x00\x12\x18\n\x14LOOP_VERDICT_PENDING\x10\x01\x12\x19\n\x15LOOP_VERDICT_ACCEPTED\x10\x02\x12\x19\n\x15LOOP_VERDICT_REJECTED\x10\x03\x32\xb1\x06\n\x0eMappingService\x12X\n\rRegisterAgent\x12\".magicslam.v1.RegisterAgentRequest\x1a#.magicslam.v1.RegisterAgentResponse\x12W\n\x0cSubmitSubmap\x12!.magicslam.v1.SubmitSubmapRequest\x1a\".magicslam.v1.SubmitSubmapResponse(\x01\x12R\n\x0b\x46inishAgent\x12 .magicslam.v1.FinishAgentRequest\x1a!.magicslam.v1.FinishAgentResponse\x12O\n\nQueryLoops\x12\x1f.magicslam.v1.QueryLoopsRequest\x1a .magicslam.v1.QueryLoopsResponse\x12L\n\tListLoops\x12\x1e.magicslam.v1.ListLoopsRequest\x1a\x1f.magicslam.v1.ListLoopsResponse\x12\x64\n\x11GetCorrectedPoses\x12&.magicslam.v1.GetCorrectedPosesRequest\x1a\'.magicslam.v1.GetCorrectedPosesResponse\x12l\n\x13WatchCorrectedPoses\x12(.magicslam.v1.WatchCorrectedPosesRequest\x1a).magicslam.v1.WatchCorrectedPosesResponse0\x01\x12Z\n\rGetTrajectory\x12\".magicslam.v1.GetTrajectoryRequest\x1a#.magicslam.v1.GetTrajectoryResponse0\x01\x12I\n\x08Localize\x12\x1d.magicslam.v1.LocalizeRequest\x1a\x1e.magicslam.v1.LocalizeResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"magicslam/v1/mapping_service.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1bmagicslam/v1/geometry.proto\x1a\x19magicslam/v1/submap.proto\"t\n\x14RegisterAgentRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\x1b\n\x13\x64\x65scriptor_model_id\x18\x03 \x01(\t\x12\x1c\n\x14\x64\x65scriptor_dimension\x18\x04 \x01(\r\"\x97\x01\n\x15RegisterAgentResponse\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x19\n\x11next_submap_index\x18\x02 \x01(\r\x12\x0f\n\x07resumed\x18\x03 \x01(\x08\x12\x10\n\x08revision\x18\x04 \x01(\x04\x12\x18\n\x10max_submap_bytes\x18\x05 \x01(\x04\x12\x17\n\x0fmax_chunk_bytes\x18\x06 \x01(\r\"x\n\x13SubmitSubmapRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeaderH\x00\x12(\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x17.magicslam.v1.BlobChunkH\x00\x42\t\n\x07payload\"\x80\x01\n\x14SubmitSubmapResponse\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0cstored_bytes\x18\x03 \x01(\x04\x12\x11\n\tduplicate\x18\x04 \x01(\x08\"9\n\x13ResumeUploadRequest\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\"q\n\x14ResumeUploadResponse\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x12\n\nblob_index\x18\x02 \x01(\r\x12\x0e\n\x06offset\x18\x03 \x01(\x04\x12\x15\n\rdurable_bytes\x18\x04 \x01(\x04\x12\x0e\n\x06stored\x18\x05 \x01(\x08\"7\n\x12\x46inishAgentRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\":\n\x13\x46inishAgentResponse\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x14\n\x0csubmap_count\x18\x02 \x01(\r\"\xad\x02\n\rLoopCandidate\x12\x0e\n\x06source\x18\x01 \x01(\t\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\x12\n\nsimilarity\x18\x03 \x01(\x01\x12*\n\x07verdict\x18\x04 \x01(\x0e\x32\x19.magicslam.v1.LoopVerdict\x12\x0e\n\x06reason\x18\x05 \x01(\t\x12.\n\x12target_from_source\x18\x06 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0binformation\x18\x07 \x03(\x01\x12\x0f\n\x07\x66itness\x18\x08 \x01(\x01\x12\x0e\n\x06rmse_m\x18\t \x01(\x01\x12\x0f\n\x07inliers\x18\n \x01(\r\x12\x0f\n\x07overlap\x18\x0b \x01(\x01\x12\x16\n\x0everify_seconds\x18\x0c \x01(\x01\x12\x0c\n\x04kept\x18\r \x01(\x08\"\x9f\x01\n\x11QueryLoopsRequest\x12\x10\n\x06submap\x18\x01 \x01(\tH\x00\x12.\n\ndescriptor\x18\x02 \x01(\x0b\x32\x18.magicslam.v1.DescriptorH\x00\x12\x0f\n\x07session\x18\x03 \x01(\t\x12\x16\n\x0emax_candidates\x18\x04 \x01(\r\x12\x16\n\x0emin_similarity\x18\x05 \x01(\x01\x42\x07\n\x05query\"W\n\x12QueryLoopsResponse\x12/\n\ncandidates\x18\x01 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12\x10\n\x08revision\x18\x02 \x01(\x04\"J\n\x10ListLoopsRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\r\x12\x12\n\npage_token\x18\x03 \x01(\t\"o\n\x11ListLoopsResponse\x12/\n\ncandidates\x18\x01 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\"a\n\rCorrectedPose\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12-\n\x11world_from_anchor\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\"=\n\tComponent\x12\n\n\x02id\x18\x01 \x01(\t\x12\x14\n\x0csubmap_count\x18\x02 \x01(\r\x12\x0e\n\x06\x61gents\x18\x03 \x03(\t\"\xe1\x01\n\x0cPoseSnapshot\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\x10\n\x08revision\x18\x02 \x01(\x04\x12-\n\tsolved_at\x18\x03 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12*\n\x05poses\x18\x04 \x03(\x0b\x32\x1b.magicslam.v1.CorrectedPose\x12+\n\ncomponents\x18\x05 \x03(\x0b\x32\x17.magicslam.v1.Component\x12\x12\n\nloop_count\x18\x06 \x01(\r\x12\x12\n\nloops_kept\x18\x07 \x01(\r\":\n\x18GetCorrectedPosesRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\r\n\x05\x61gent\x18\x02 \x01(\t\"I\n\x19GetCorrectedPosesResponse\x12,\n\x08snapshot\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\"T\n\x1aWatchCorrectedPosesRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12\r\n\x05\x61gent\x18\x02 \x01(\t\x12\x16\n\x0e\x61\x66ter_revision\x18\x03 \x01(\x04\"K\n\x1bWatchCorrectedPosesResponse\x12,\n\x08snapshot\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\"5\n\x14GetTrajectoryRequest\x12\r\n\x05\x61gent\x18\x01 \x01(\t\x12\x0e\n\x06wait_s\x18\x02 \x01(\x01\"w\n\x0e\x43orrectedFrame\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12-\n\x11world_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0c\n\x04lost\x18\x04 \x01(\x08\"z\n\x15GetTrajectoryResponse\x12\x0e\n\x06submap\x18\x01 \x01(\t\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\x12,\n\x06\x66rames\x18\x04 \x03(\x0b\x32\x1c.magicslam.v1.CorrectedFrame\"\xcd\x01\n\x0fLocalizeRequest\x12\x0f\n\x07session\x18\x01 \x01(\t\x12$\n\x06\x63\x61mera\x18\x02 \x01(\x0b\x32\x14.magicslam.v1.Camera\x12\x0e\n\x06\x63olour\x18\x03 \x01(\x0c\x12\x19\n\x11\x63olour_media_type\x18\x04 \x01(\t\x12\x11\n\tdepth_png\x18\x05 \x01(\x0c\x12\x17\n\x0fmetres_per_unit\x18\x06 \x01(\x01\x12,\n\ndescriptor\x18\x07 \x01(\x0b\x32\x18.magicslam.v1.Descriptor\"\xa6\x02\n\x10LocalizeResponse\x12-\n\x11world_from_camera\x18\x01 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x11\n\tcomponent\x18\x02 \x01(\t\x12\x10\n\x08revision\x18\x03 \x01(\x04\x12\x0e\n\x06submap\x18\x04 \x01(\t\x12.\n\x12\x61nchor_from_camera\x18\x05 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0f\n\x07\x66itness\x18\x06 \x01(\x01\x12\x0e\n\x06rmse_m\x18\x07 \x01(\x01\x12\x0f\n\x07inliers\x18\x08 \x01(\r\x12\x0f\n\x07overlap\x18\t \x01(\x01\x12\x12\n\nsimilarity\x18\n \x01(\x01\x12\x12\n\nconfidence\x18\x0b \x01(\x01\x12\x13\n\x0binformation\x18\x0c \x03(\x01*{\n\x0bLoopVerdict\x12\x1c\n\x18LOOP_VERDICT_UNSPECIFIED\x10\x00\x12\x18\n\x14LOOP_VERDICT_PENDING\x10\x01\x12\x19\n\x15LOOP_VERDICT_ACCEPTED\x10\x02\x12\x19\n\x15LOOP_VERDICT_REJECTED\x10\x03\x32\x88\x07\n\x0eMappingService\x12X\n\rRegisterAgent\x12\".magicslam.v1.RegisterAgentRequest\x1a#.magicslam.v1.RegisterAgentResponse\x12W\n\x0cSubmitSubmap\x12!.magicslam.v1.SubmitSubmapRequest\x1a\".magicslam.v1.SubmitSubmapResponse(\x01\x12U\n\x0cResumeUpload\x12!.magicslam.v1.ResumeUploadRequest\x1a\".magicslam.v1.ResumeUploadResponse\x12R\n\x0b\x46inishAgent\x12 .magicslam.v1.FinishAgentRequest\x1a!.magicslam.v1.FinishAgentResponse\x12O\n\nQueryLoops\x12\x1f.magicslam.v1.QueryLoopsRequest\x1a .magicslam.v1.QueryLoopsResponse\x12L\n\tListLoops\x12\x1e.magicslam.v1.ListLoopsRequest\x1a\x1f.magicslam.v1.ListLoopsResponse\x12\x64\n\x11GetCorrectedPoses\x12&.magicslam.v1.GetCorrectedPosesRequest\x1a\'.magicslam.v1.GetCorrectedPosesResponse\x12l\n\x13WatchCorrectedPoses\x12(.magicslam.v1.WatchCorrectedPosesRequest\x1a).magicslam.v1.WatchCorrectedPosesResponse0\x01\x12Z\n\rGetTrajectory\x12\".magicslam.v1.GetTrajectoryRequest\x1a#.magicslam.v1.GetTrajectoryResponse0\x01\x12I\n\x08Localize\x12\x1d.magicslam.v1.LocalizeRequest\x1a\x1e.magicslam.v1.LocalizeResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'magicslam.v1.mapping_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_LOOPVERDICT']._serialized_start=3020
-  _globals['_LOOPVERDICT']._serialized_end=3143
+  _globals['_LOOPVERDICT']._serialized_start=3194
+  _globals['_LOOPVERDICT']._serialized_end=3317
   _globals['_REGISTERAGENTREQUEST']._serialized_start=141
   _globals['_REGISTERAGENTREQUEST']._serialized_end=257
   _globals['_REGISTERAGENTRESPONSE']._serialized_start=260
@@ -44,44 +44,48 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_SUBMITSUBMAPREQUEST']._serialized_end=533
   _globals['_SUBMITSUBMAPRESPONSE']._serialized_start=536
   _globals['_SUBMITSUBMAPRESPONSE']._serialized_end=664
-  _globals['_FINISHAGENTREQUEST']._serialized_start=666
-  _globals['_FINISHAGENTREQUEST']._serialized_end=721
-  _globals['_FINISHAGENTRESPONSE']._serialized_start=723
-  _globals['_FINISHAGENTRESPONSE']._serialized_end=781
-  _globals['_LOOPCANDIDATE']._serialized_start=784
-  _globals['_LOOPCANDIDATE']._serialized_end=1085
-  _globals['_QUERYLOOPSREQUEST']._serialized_start=1088
-  _globals['_QUERYLOOPSREQUEST']._serialized_end=1247
-  _globals['_QUERYLOOPSRESPONSE']._serialized_start=1249
-  _globals['_QUERYLOOPSRESPONSE']._serialized_end=1336
-  _globals['_LISTLOOPSREQUEST']._serialized_start=1338
-  _globals['_LISTLOOPSREQUEST']._serialized_end=1412
-  _globals['_LISTLOOPSRESPONSE']._serialized_start=1414
-  _globals['_LISTLOOPSRESPONSE']._serialized_end=1525
-  _globals['_CORRECTEDPOSE']._serialized_start=1527
-  _globals['_CORRECTEDPOSE']._serialized_end=1624
-  _globals['_COMPONENT']._serialized_start=1626
-  _globals['_COMPONENT']._serialized_end=1687
-  _globals['_POSESNAPSHOT']._serialized_start=1690
-  _globals['_POSESNAPSHOT']._serialized_end=1915
-  _globals['_GETCORRECTEDPOSESREQUEST']._serialized_start=1917
-  _globals['_GETCORRECTEDPOSESREQUEST']._serialized_end=1975
-  _globals['_GETCORRECTEDPOSESRESPONSE']._serialized_start=1977
-  _globals['_GETCORRECTEDPOSESRESPONSE']._serialized_end=2050
-  _globals['_WATCHCORRECTEDPOSESREQUEST']._serialized_start=2052
-  _globals['_WATCHCORRECTEDPOSESREQUEST']._serialized_end=2136
-  _globals['_WATCHCORRECTEDPOSESRESPONSE']._serialized_start=2138
-  _globals['_WATCHCORRECTEDPOSESRESPONSE']._serialized_end=2213
-  _globals['_GETTRAJECTORYREQUEST']._serialized_start=2215
-  _globals['_GETTRAJECTORYREQUEST']._serialized_end=2268
-  _globals['_CORRECTEDFRAME']._serialized_start=2270
-  _globals['_CORRECTEDFRAME']._serialized_end=2389
-  _globals['_GETTRAJECTORYRESPONSE']._serialized_start=2391
-  _globals['_GETTRAJECTORYRESPONSE']._serialized_end=2513
-  _globals['_LOCALIZEREQUEST']._serialized_start=2516
-  _globals['_LOCALIZEREQUEST']._serialized_end=2721
-  _globals['_LOCALIZERESPONSE']._serialized_start=2724
-  _globals['_LOCALIZERESPONSE']._serialized_end=3018
-  _globals['_MAPPINGSERVICE']._serialized_start=3146
-  _globals['_MAPPINGSERVICE']._serialized_end=3963
+  _globals['_RESUMEUPLOADREQUEST']._serialized_start=666
+  _globals['_RESUMEUPLOADREQUEST']._serialized_end=723
+  _globals['_RESUMEUPLOADRESPONSE']._serialized_start=725
+  _globals['_RESUMEUPLOADRESPONSE']._serialized_end=838
+  _globals['_FINISHAGENTREQUEST']._serialized_start=840
+  _globals['_FINISHAGENTREQUEST']._serialized_end=895
+  _globals['_FINISHAGENTRESPONSE']._serialized_start=897
+  _globals['_FINISHAGENTRESPONSE']._serialized_end=955
+  _globals['_LOOPCANDIDATE']._serialized_start=958
+  _globals['_LOOPCANDIDATE']._serialized_end=1259
+  _globals['_QUERYLOOPSREQUEST']._serialized_start=1262
+  _globals['_QUERYLOOPSREQUEST']._serialized_end=1421
+  _globals['_QUERYLOOPSRESPONSE']._serialized_start=1423
+  _globals['_QUERYLOOPSRESPONSE']._serialized_end=1510
+  _globals['_LISTLOOPSREQUEST']._serialized_start=1512
+  _globals['_LISTLOOPSREQUEST']._serialized_end=1586
+  _globals['_LISTLOOPSRESPONSE']._serialized_start=1588
+  _globals['_LISTLOOPSRESPONSE']._serialized_end=1699
+  _globals['_CORRECTEDPOSE']._serialized_start=1701
+  _globals['_CORRECTEDPOSE']._serialized_end=1798
+  _globals['_COMPONENT']._serialized_start=1800
+  _globals['_COMPONENT']._serialized_end=1861
+  _globals['_POSESNAPSHOT']._serialized_start=1864
+  _globals['_POSESNAPSHOT']._serialized_end=2089
+  _globals['_GETCORRECTEDPOSESREQUEST']._serialized_start=2091
+  _globals['_GETCORRECTEDPOSESREQUEST']._serialized_end=2149
+  _globals['_GETCORRECTEDPOSESRESPONSE']._serialized_start=2151
+  _globals['_GETCORRECTEDPOSESRESPONSE']._serialized_end=2224
+  _globals['_WATCHCORRECTEDPOSESREQUEST']._serialized_start=2226
+  _globals['_WATCHCORRECTEDPOSESREQUEST']._serialized_end=2310
+  _globals['_WATCHCORRECTEDPOSESRESPONSE']._serialized_start=2312
+  _globals['_WATCHCORRECTEDPOSESRESPONSE']._serialized_end=2387
+  _globals['_GETTRAJECTORYREQUEST']._serialized_start=2389
+  _globals['_GETTRAJECTORYREQUEST']._serialized_end=2442
+  _globals['_CORRECTEDFRAME']._serialized_start=2444
+  _globals['_CORRECTEDFRAME']._serialized_end=2563
+  _globals['_GETTRAJECTORYRESPONSE']._serialized_start=2565
+  _globals['_GETTRAJECTORYRESPONSE']._serialized_end=2687
+  _globals['_LOCALIZEREQUEST']._serialized_start=2690
+  _globals['_LOCALIZEREQUEST']._serialized_end=2895
+  _globals['_LOCALIZERESPONSE']._serialized_start=2898
+  _globals['_LOCALIZERESPONSE']._serialized_end=3192
+  _globals['_MAPPINGSERVICE']._serialized_start=3320
+  _globals['_MAPPINGSERVICE']._serialized_end=4224
 # @@protoc_insertion_point(module_scope)

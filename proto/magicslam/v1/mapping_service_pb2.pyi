@@ -203,6 +203,72 @@ class SubmitSubmapResponse(_message.Message):
 Global___SubmitSubmapResponse: _TypeAlias = SubmitSubmapResponse  # noqa: Y015
 
 @_typing.final
+class ResumeUploadRequest(_message.Message):
+    """Asks where an upload goes on."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SUBMAP_FIELD_NUMBER: _builtins.int
+    REQUEST_ID_FIELD_NUMBER: _builtins.int
+    submap: _builtins.str
+    """Resource name of the sub-map."""
+    request_id: _builtins.str
+    """The header's `request_id`."""
+    def __init__(
+        self,
+        *,
+        submap: _builtins.str = ...,
+        request_id: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["request_id", b"request_id", "submap", b"submap"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ResumeUploadRequest: _TypeAlias = ResumeUploadRequest  # noqa: Y015
+
+@_typing.final
+class ResumeUploadResponse(_message.Message):
+    """Where the first chunk of the next stream has to begin."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    SUBMAP_FIELD_NUMBER: _builtins.int
+    BLOB_INDEX_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    DURABLE_BYTES_FIELD_NUMBER: _builtins.int
+    STORED_FIELD_NUMBER: _builtins.int
+    submap: _builtins.str
+    """Resource name of the sub-map."""
+    blob_index: _builtins.int
+    """Blob that the next chunk belongs to. The number of blobs when none is missing: then the next
+    stream is the header alone.
+    """
+    offset: _builtins.int
+    """Position of the next chunk within that blob, bytes."""
+    durable_bytes: _builtins.int
+    """Bytes of all blobs that the server holds already."""
+    stored: _builtins.bool
+    """True when the sub-map is stored by this request: a stream with the header gets the first answer."""
+    def __init__(
+        self,
+        *,
+        submap: _builtins.str = ...,
+        blob_index: _builtins.int = ...,
+        offset: _builtins.int = ...,
+        durable_bytes: _builtins.int = ...,
+        stored: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["blob_index", b"blob_index", "durable_bytes", b"durable_bytes", "offset", b"offset", "stored", b"stored", "submap", b"submap"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ResumeUploadResponse: _TypeAlias = ResumeUploadResponse  # noqa: Y015
+
+@_typing.final
 class FinishAgentRequest(_message.Message):
     """Says that an agent is done."""
 

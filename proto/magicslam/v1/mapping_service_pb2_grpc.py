@@ -45,6 +45,11 @@ class MappingServiceStub:
                 request_serializer=magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapRequest.SerializeToString,
                 response_deserializer=magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapResponse.FromString,
                 _registered_method=True)
+        self.ResumeUpload = channel.unary_unary(
+                '/magicslam.v1.MappingService/ResumeUpload',
+                request_serializer=magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadRequest.SerializeToString,
+                response_deserializer=magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadResponse.FromString,
+                _registered_method=True)
         self.FinishAgent = channel.unary_unary(
                 '/magicslam.v1.MappingService/FinishAgent',
                 request_serializer=magicslam_dot_v1_dot_mapping__service__pb2.FinishAgentRequest.SerializeToString,
@@ -97,7 +102,19 @@ class MappingServiceServicer:
     def SubmitSubmap(self, request_iterator, context):
         """Stores a finished sub-map: a header, then the chunks of every blob. The answer means durable:
         the sub-map survives the end of the server at any later instant. Idempotent by the header's
-        `request_id`. A refused sub-map leaves nothing behind.
+        `request_id`. A refused sub-map leaves nothing behind. A stream that breaks is kept as far as it
+        came: after ResumeUpload, a new stream sends the header again and then the chunks that are missing.
+        A stream whose first chunk is blob 0 at offset 0 starts over.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ResumeUpload(self, request, context):
+        """Says where an upload that was broken off goes on, and ends a stream of it that the server still
+        takes for alive. What is kept is on the server's disk; it is dropped when nobody goes on with it
+        for a day, or earlier when the agent breaks off many, and the answer is then the beginning.
+        Changes nothing that is stored.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -170,6 +187,11 @@ def add_MappingServiceServicer_to_server(servicer, server):
                     servicer.SubmitSubmap,
                     request_deserializer=magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapRequest.FromString,
                     response_serializer=magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapResponse.SerializeToString,
+            ),
+            'ResumeUpload': grpc.unary_unary_rpc_method_handler(
+                    servicer.ResumeUpload,
+                    request_deserializer=magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadRequest.FromString,
+                    response_serializer=magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadResponse.SerializeToString,
             ),
             'FinishAgent': grpc.unary_unary_rpc_method_handler(
                     servicer.FinishAgent,
@@ -262,6 +284,33 @@ class MappingService:
             '/magicslam.v1.MappingService/SubmitSubmap',
             magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapRequest.SerializeToString,
             magicslam_dot_v1_dot_mapping__service__pb2.SubmitSubmapResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ResumeUpload(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/magicslam.v1.MappingService/ResumeUpload',
+            magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadRequest.SerializeToString,
+            magicslam_dot_v1_dot_mapping__service__pb2.ResumeUploadResponse.FromString,
             options,
             channel_credentials,
             insecure,

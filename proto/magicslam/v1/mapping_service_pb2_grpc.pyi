@@ -27,7 +27,15 @@ class MappingServiceStub:
     SubmitSubmap: _aio.StreamUnaryMultiCallable[_mapping_service_pb2.SubmitSubmapRequest, _mapping_service_pb2.SubmitSubmapResponse]
     """Stores a finished sub-map: a header, then the chunks of every blob. The answer means durable:
     the sub-map survives the end of the server at any later instant. Idempotent by the header's
-    `request_id`. A refused sub-map leaves nothing behind.
+    `request_id`. A refused sub-map leaves nothing behind. A stream that breaks is kept as far as it
+    came: after ResumeUpload, a new stream sends the header again and then the chunks that are missing.
+    A stream whose first chunk is blob 0 at offset 0 starts over.
+    """
+    ResumeUpload: _aio.UnaryUnaryMultiCallable[_mapping_service_pb2.ResumeUploadRequest, _mapping_service_pb2.ResumeUploadResponse]
+    """Says where an upload that was broken off goes on, and ends a stream of it that the server still
+    takes for alive. What is kept is on the server's disk; it is dropped when nobody goes on with it
+    for a day, or earlier when the agent breaks off many, and the answer is then the beginning.
+    Changes nothing that is stored.
     """
     FinishAgent: _aio.UnaryUnaryMultiCallable[_mapping_service_pb2.FinishAgentRequest, _mapping_service_pb2.FinishAgentResponse]
     """Says that an agent will send no more sub-maps. Nothing waits for it: an agent that disappears
@@ -76,7 +84,21 @@ class MappingServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _abc.Awaitable[_mapping_service_pb2.SubmitSubmapResponse]:
         """Stores a finished sub-map: a header, then the chunks of every blob. The answer means durable:
         the sub-map survives the end of the server at any later instant. Idempotent by the header's
-        `request_id`. A refused sub-map leaves nothing behind.
+        `request_id`. A refused sub-map leaves nothing behind. A stream that breaks is kept as far as it
+        came: after ResumeUpload, a new stream sends the header again and then the chunks that are missing.
+        A stream whose first chunk is blob 0 at offset 0 starts over.
+        """
+
+    @_abc_1.abstractmethod
+    def ResumeUpload(
+        self,
+        request: _mapping_service_pb2.ResumeUploadRequest,
+        context: _aio.ServicerContext[_mapping_service_pb2.ResumeUploadRequest, _abc.Awaitable[_mapping_service_pb2.ResumeUploadResponse]],
+    ) -> _abc.Awaitable[_mapping_service_pb2.ResumeUploadResponse]:
+        """Says where an upload that was broken off goes on, and ends a stream of it that the server still
+        takes for alive. What is kept is on the server's disk; it is dropped when nobody goes on with it
+        for a day, or earlier when the agent breaks off many, and the answer is then the beginning.
+        Changes nothing that is stored.
         """
 
     @_abc_1.abstractmethod

@@ -1,0 +1,256 @@
+"""An upload that breaks off goes on where it broke, also on a server that was started again."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+import time
+from collections.abc import AsyncIterator
+
+import grpc
+import grpc.aio
+import pytest
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
+from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
+
+from magic_agent.client import MagicClient
+from magic_core.errors import AlreadyExists, InvalidInput, MagicError, NotFound, Unavailable
+from magic_core.wire import EncodedSubmap, chunks_of, encode_submap, error_of
+from magic_server.config import ServerConfig, ServiceLimits
+from magic_server.server import Server
+from magic_server.upload_config import PartialUploadLimits
+from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.waiting import eventually
+
+CHUNK = 1000
+NAME = "sessions/room/agents/agent_0/submaps/0"
+Requests = list[mapping_pb.SubmitSubmapRequest]
+
+
+@pytest.fixture
+async def registered(client: MagicClient) -> MagicClient:
+    """A client whose agent_0 is in session `room`."""
+    await register(client)
+    return client
+
+
+async def register(client: MagicClient) -> None:
+    await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+
+
+def encoded(request_id: str = "first", index: int = 0) -> EncodedSubmap:
+    return encode_submap(make_submap(index=index), request_id=request_id)
+
+
+def messages(submap: EncodedSubmap, *, blob: int = 0, offset: int = 0) -> Requests:
+    """Header and chunks from a position on."""
+    found = [mapping_pb.SubmitSubmapRequest(header=submap.header)]
+    for index in range(blob, len(submap.blobs)):
+        begin = offset if index == blob else 0
+        chunks = chunks_of(submap.blobs[index], blob_index=index, chunk_bytes=CHUNK, begin=begin)
+        found += [mapping_pb.SubmitSubmapRequest(chunk=chunk) for chunk in chunks]
+    return found
+
+
+async def send(server: Server, sent: Requests, *, hold: bool = False) -> str:
+    """Send raw messages; with `hold` the stream then stays open until the call is cancelled."""
+
+    async def stream() -> AsyncIterator[mapping_pb.SubmitSubmapRequest]:
+        for message in sent:
+            yield message
+        if hold:
+            await asyncio.Event().wait()
+
+    async with grpc.aio.insecure_channel(server.address) as channel:
+        stub = mapping_grpc.MappingServiceStub(channel)
+        try:
+            return (await stub.SubmitSubmap(stream(), timeout=60)).submap
+        except grpc.RpcError as failure:
+            raise error_of(failure) from failure
+
+
+def held_bytes(server: Server) -> int:
+    """Bytes of blobs that lie in the folder of uploads."""
+    folder = server.config.data_dir / "uploads"
+    return sum(file.stat().st_size for file in folder.glob("*/[0-9]*"))
+
+
+def payload(sent: Requests) -> int:
+    return sum(len(message.chunk.data) for message in sent)
+
+
+async def break_off(server: Server, sent: Requests) -> None:
+    """Send some messages and then vanish, once the server has written them."""
+    sending = asyncio.create_task(send(server, sent, hold=True))
+    await eventually(lambda: held_bytes(server) == payload(sent))
+    sending.cancel()
+    await asyncio.gather(sending, return_exceptions=True)
+    await eventually(lambda: server_kept(server)[1] == payload(sent))
+
+
+def server_kept(server: Server) -> tuple[int, int]:
+    return server._store.uploads.kept()
+
+
+async def test_a_broken_stream_goes_on_behind_the_last_byte_that_came(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    sent = messages(submap)[:14]
+    await break_off(server, sent)
+    position = await registered.resume_upload(NAME, "first")
+    last = sent[-1].chunk
+    assert (position.blob_index, position.offset) == (
+        last.blob_index,
+        last.offset + len(last.data),
+    )
+    assert position.durable_bytes == payload(sent)
+    assert not position.stored
+    assert await registered.list_submaps("room") == ()
+
+    rest = messages(submap, blob=position.blob_index, offset=position.offset)
+    assert payload(rest) + payload(sent) == sum(map(len, submap.blobs))
+    assert await send(server, rest) == NAME
+    found = await registered.download_encoded(NAME)
+    assert (found.header, found.blobs) == (submap.header, submap.blobs)
+    assert list((server.config.data_dir / "uploads").iterdir()) == []
+
+
+async def test_a_server_that_was_killed_goes_on_with_what_had_come(
+    server_config: ServerConfig,
+) -> None:
+    submap = encoded()
+    sent = messages(submap)[:20]
+    async with Server(server_config) as first, MagicClient(first.address) as client:
+        await register(client)
+        sending = asyncio.create_task(send(first, sent, hold=True))
+        await eventually(lambda: held_bytes(first) == payload(sent))
+        folder = server_config.data_dir / "uploads"
+        # What a killed process leaves, before anything is tidied up.
+        left = {file: file.read_bytes() for file in folder.glob("*/*")}
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+    for file, data in left.items():
+        file.write_bytes(data)
+    async with Server(server_config) as second, MagicClient(second.address) as client:
+        position = await client.resume_upload(NAME, "first")
+        assert position.durable_bytes == payload(sent)
+        receipt = await client.submit_encoded(submap, resume=True)
+        assert not receipt.duplicate
+        assert (await client.download_encoded(NAME)).blobs == submap.blobs
+
+
+async def test_bytes_that_the_disk_lost_are_sent_again(server_config: ServerConfig) -> None:
+    submap = encoded()
+    sent = messages(submap)[:20]
+    async with Server(server_config) as first, MagicClient(first.address) as client:
+        await register(client)
+        await break_off(first, sent)
+    # As after a loss of power: the newest chunk is zeros, and another one is cut off.
+    last = sent[-1].chunk
+    blob = next((server_config.data_dir / "uploads").glob(f"*/{last.blob_index:05d}"))
+    with blob.open("r+b") as file:
+        file.seek(last.offset)
+        file.write(bytes(len(last.data)))
+    os.truncate(blob, blob.stat().st_size - 10)
+    async with Server(server_config) as second, MagicClient(second.address) as client:
+        position = await client.resume_upload(NAME, "first")
+        assert position.durable_bytes == payload(sent[:-1])
+        await client.submit_encoded(submap, resume=True)
+        assert (await client.download_encoded(NAME)).blobs == submap.blobs
+
+
+async def test_a_new_stream_takes_over_from_one_that_looks_alive(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    sent = messages(submap)[:10]
+    stale = asyncio.create_task(send(server, sent, hold=True))
+    await eventually(lambda: held_bytes(server) == payload(sent))
+    receipt = await registered.submit_encoded(submap, resume=True)
+    assert receipt.submap == NAME
+    with pytest.raises(Unavailable, match="taken over"):
+        await stale
+    assert len(await registered.list_submaps("room")) == 1
+
+
+async def test_a_stream_from_the_beginning_starts_over(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    await break_off(server, messages(submap)[:10])
+    assert await send(server, messages(submap)) == NAME
+    assert (await registered.download_encoded(NAME)).blobs == submap.blobs
+
+
+async def test_what_came_under_another_header_is_not_gone_on_with(
+    registered: MagicClient, server: Server
+) -> None:
+    submap, other = encoded(), encoded()
+    await break_off(server, messages(submap)[:10])
+    other.header.trajectory[1].lost = not other.header.trajectory[1].lost
+    with pytest.raises(InvalidInput, match="expected blob 0"):
+        await send(server, messages(other, blob=0, offset=CHUNK))
+    assert server_kept(server) == (0, 0)
+    assert await send(server, messages(other)) == NAME
+
+
+async def test_a_refusal_after_resuming_leaves_nothing(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    sent = messages(submap)
+    await break_off(server, sent[:10])
+    position = await registered.resume_upload(NAME, "first")
+    rest = messages(submap, blob=position.blob_index, offset=position.offset)
+    data = rest[-1].chunk.data
+    changed = next(chunks_of(data[:-1] + bytes([data[-1] ^ 1])))
+    rest[-1].chunk.data, rest[-1].chunk.crc32 = changed.data, changed.crc32
+    with pytest.raises(MagicError, match="SHA-256"):
+        await send(server, rest)
+    assert list((server.config.data_dir / "uploads").iterdir()) == []
+    assert (await registered.resume_upload(NAME, "first")).durable_bytes == 0
+
+
+async def test_of_a_stored_submap_the_header_is_enough(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    first = await registered.submit_encoded(submap)
+    position = await registered.resume_upload(NAME, "first")
+    assert position.stored
+    assert await send(server, messages(submap)[:1]) == NAME
+    second = await registered.submit_encoded(submap, resume=True)
+    assert second == dataclasses.replace(first, duplicate=True)
+    with pytest.raises(AlreadyExists, match="another request"):
+        await registered.resume_upload(NAME, "second")
+    with pytest.raises(NotFound, match="agent_9"):
+        await registered.resume_upload(NAME.replace("agent_0", "agent_9"), "first")
+
+
+async def test_uploads_that_broke_off_are_bounded_and_expire(server_config: ServerConfig) -> None:
+    kept = PartialUploadLimits(max_per_agent=2)
+    limits = ServiceLimits(partial_uploads=kept)
+    config = dataclasses.replace(server_config, limits=limits)
+    submaps = [encoded(request_id=f"r{i}") for i in range(3)]
+    async with Server(config) as server, MagicClient(server.address) as client:
+        await register(client)
+        for submap in submaps:
+            sending = asyncio.create_task(send(server, messages(submap)[:8], hold=True))
+            held = server_kept(server)
+            await eventually(lambda h=held: held_bytes(server) > h[1])
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            await eventually(lambda: not any(server._receiver._claims))
+        assert server_kept(server)[0] == 2
+        assert (await client.resume_upload(NAME, "r0")).durable_bytes == 0
+        assert (await client.resume_upload(NAME, "r2")).durable_bytes > 0
+    folder = config.data_dir / "uploads"
+    assert len(list(folder.iterdir())) == 2
+    yesterday = time.time() - 2 * kept.max_age_s
+    for path in [*folder.glob("*/*"), *folder.iterdir()]:
+        os.utime(path, (yesterday, yesterday))
+    (folder / "stray").mkdir()
+    async with Server(config):
+        assert list(folder.iterdir()) == []
