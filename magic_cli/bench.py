@@ -3,6 +3,7 @@
 magic bench render [--against PROTOTYPE]   forward and backward of the rasteriser
 magic bench track DATASET                  accuracy and speed of tracking, solver by solver
 magic bench loops DATASET...               precision and recall of loop detection and verification
+magic bench server                         many agents at once: rate, latencies, memory, event loop
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ BENCHMARKS = {
     "render": "magic_cli.benchmarks.render",
     "track": "magic_cli.benchmarks.track",
     "loops": "magic_cli.benchmarks.loops",
+    "server": "magic_cli.benchmarks.server",
 }
 
 

@@ -7,6 +7,8 @@ from typing import Literal
 
 from magic_core.errors import ConfigError, FieldViolation
 
+_UNBOUNDED = 10_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class KeyframeConfig:
@@ -18,6 +20,8 @@ class KeyframeConfig:
     """Turn since the last keyframe in degrees."""
     novelty: float = 0.06
     """Share of the frame's pixels that the sub-map does not explain."""
+    urgent_novelty: float = 0.3
+    """The same, above which a live agent takes a keyframe even when it has no time."""
     min_gap: int = 2
     """Frames between keyframes at least, so that mapping cannot starve tracking."""
     max_gap: int = 10
@@ -41,6 +45,8 @@ class MappingConfig:
     """Optimisation steps per keyframe."""
     anchor_iterations: int = 28
     """Optimisation steps on the first keyframe of a sub-map."""
+    least_iterations: int = 3
+    """Optimisation steps per keyframe that a live agent takes even when it has no time."""
     settle: float = 0.01
     """Stop early when an iteration gains less than this share of the loss; 0 never stops early."""
     newest_share: float = 0.4
@@ -86,6 +92,7 @@ class MappingConfig:
         rules = {
             "iterations": (self.iterations >= 1, "expected at least 1"),
             "anchor_iterations": (self.anchor_iterations >= 1, "expected at least 1"),
+            "least_iterations": (self.least_iterations >= 0, "expected 0 or more"),
             "keyframe_every": (self.keyframe_every >= 0, "expected 0 or more frames"),
             "newest_share": (0.0 <= self.newest_share <= 1.0, "expected 0 to 1"),
             "seed_opacity": (0.0 < self.seed_opacity < 1.0, "expected between 0 and 1"),
@@ -104,7 +111,7 @@ class MappingConfig:
 
 
 def paper_schedule(config: MappingConfig) -> MappingConfig:
-    """The values of the paper's supplement, "Mapping", put into a config."""
+    """The values of the paper's supplement, "Mapping", put into a config; it knows no bound."""
     return replace(
         config,
         keyframe_every=5,
@@ -117,4 +124,5 @@ def paper_schedule(config: MappingConfig) -> MappingConfig:
         alpha_threshold=0.98,
         depth_error_factor=40.0,
         prune_opacity=0.1,
+        max_gaussians=_UNBOUNDED,
     )

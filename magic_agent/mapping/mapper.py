@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +16,31 @@ from magic_agent.mapping.seeder import Seeder
 from magic_core.data import Frame
 from magic_core.errors import WrongState
 from magic_core.gaussians import GaussianCloud
+from magic_core.gaussians.morton import in_morton_order
 from magic_core.geometry import Camera, se3
 from magic_core.render import GaussianOptimiser, LearningRates, LossWeights, RenderedView
 from magic_core.submap import Keyframe
 
 Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MappingBudget:
+    """What mapping may spend on one keyframe; None leaves it to the schedule."""
+
+    iterations: int | None = None
+    """Optimisation steps at most, in place of the schedule's number."""
+    seconds: float | None = None
+    """Time at most, by the mapper's clock. Seeding and pruning always run; steps end with it."""
+    least_iterations: int = 0
+    """Steps that are taken even when the time is over."""
+
+    @classmethod
+    def within(cls, seconds: float | None, config: MappingConfig) -> MappingBudget:
+        """The schedule's steps as far as the time allows; None is no limit."""
+        if seconds is None:
+            return _UNBOUNDED
+        return cls(seconds=seconds, least_iterations=config.least_iterations)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +50,16 @@ class MappingReport:
     seeded: int
     pruned: int
     iterations: int
+    cut_iterations: int
+    """Steps of the schedule that the budget's time did not allow."""
     loss: float
     """Loss of the last step on this keyframe."""
     gaussians: int
     """Size of the sub-map afterwards."""
     duration_ms: float
+
+
+_UNBOUNDED = MappingBudget()
 
 
 class Mapper:
@@ -45,8 +72,11 @@ class Mapper:
         *,
         threads: int | None = None,
         seed: int = 0,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
+        """`clock` tells seconds; budgets and durations are measured with it."""
         self._camera = camera
+        self._clock = clock
         self._config = (config or MappingConfig()).resolved()
         self._threads = threads
         self._rng = np.random.default_rng(seed)
@@ -55,6 +85,7 @@ class Mapper:
         self._median_depths: list[float] = []
         self._window = Window(self._config.newest_share, self._rng)
         self._optimiser: GaussianOptimiser | None = None
+        self._overhead_s = self._step_s = 0.0
 
     @property
     def config(self) -> MappingConfig:
@@ -77,12 +108,18 @@ class Mapper:
         """The active sub-map as seen from a pose."""
         return self._active().render(self._camera, anchor_from_camera)
 
-    def begin(self, frame: Frame, *, carried: GaussianCloud | None = None) -> MappingReport:
+    def begin(
+        self,
+        frame: Frame,
+        *,
+        carried: GaussianCloud | None = None,
+        budget: MappingBudget = _UNBOUNDED,
+    ) -> MappingReport:
         """Start a sub-map with this frame as anchor; carried Gaussians are in its frame."""
         self._keyframes, self._median_depths = [], []
         self._window = Window(self._config.newest_share, self._rng)
         self._optimiser = GaussianOptimiser(
-            carried if carried is not None else GaussianCloud.empty(),
+            in_morton_order(carried) if carried is not None else GaussianCloud.empty(),
             weights=LossWeights(
                 ssim=self._config.ssim_weight,
                 depth=self._config.depth_weight,
@@ -91,10 +128,28 @@ class Mapper:
             learning_rates=LearningRates(means=self._config.means_rate_m),
             threads=self._threads,
         )
-        return self.insert(frame, se3.identity())
+        return self.insert(frame, se3.identity(), budget=budget)
 
-    def wants(self, frame: Frame, anchor_from_camera: Pose) -> bool:
-        """Whether this frame should become a keyframe."""
+    @property
+    def least_s(self) -> float:
+        """Seconds below which a keyframe is not worth beginning: seeding, pruning and the least
+        number of steps, as the last keyframe had them. 0 before the first."""
+        return self._overhead_s + self._config.least_iterations * self._step_s
+
+    def lacks(
+        self, frame: Frame, anchor_from_camera: Pose, *, view: RenderedView | None = None
+    ) -> bool:
+        """Whether the sub-map explains so little of a frame that tracking is at stake.
+
+        view: the sub-map as rendered from about there; None renders it.
+        """
+        novelty = self._novelty(frame, anchor_from_camera, view)
+        return novelty > self._config.keyframes.urgent_novelty
+
+    def wants(
+        self, frame: Frame, anchor_from_camera: Pose, *, view: RenderedView | None = None
+    ) -> bool:
+        """Whether this frame should become a keyframe; `view` as in `lacks`."""
         gap = frame.index - self._keyframes[-1].frame_index
         if self._config.keyframe_every > 0:
             return gap >= self._config.keyframe_every
@@ -109,12 +164,14 @@ class Mapper:
                 median_depth=self._median_depths[-1],
                 config=rule,
             )
-            or self._novelty(frame, anchor_from_camera) > rule.novelty
+            or self._novelty(frame, anchor_from_camera, view) > rule.novelty
         )
 
-    def insert(self, frame: Frame, anchor_from_camera: Pose) -> MappingReport:
+    def insert(
+        self, frame: Frame, anchor_from_camera: Pose, *, budget: MappingBudget = _UNBOUNDED
+    ) -> MappingReport:
         """Take a frame in as keyframe: seed, optimise, prune."""
-        started = time.perf_counter()
+        started = self._clock()
         seeded = self._seed(frame, anchor_from_camera)
         self._keyframes.append(
             Keyframe(frame.index, frame.timestamp_s, anchor_from_camera, frame.colour, frame.depth)
@@ -122,10 +179,14 @@ class Mapper:
         valid = frame.depth[frame.depth > 0]
         self._median_depths.append(float(np.median(valid)) if len(valid) else 1.0)
         self._window.add()
-        iterations, loss = self._optimise()
+        began = self._clock()
+        iterations, cut, loss = self._optimise(budget, started)
+        ended = self._clock()
         pruned = self._prune()
-        duration_ms = 1e3 * (time.perf_counter() - started)
-        return MappingReport(seeded, pruned, iterations, loss, len(self), duration_ms)
+        duration_s = self._clock() - started
+        self._overhead_s = duration_s - (ended - began)
+        self._step_s = (ended - began) / max(iterations, 1)
+        return MappingReport(seeded, pruned, iterations, cut, loss, len(self), 1e3 * duration_s)
 
     def split(self, anchor_from_next: Pose) -> tuple[GaussianCloud, GaussianCloud]:
         """(sent, kept): what the next anchor cannot see; what it sees, moved to its frame.
@@ -147,7 +208,7 @@ class Mapper:
             frame, view, limit=room, existing=self._means_seen(view, anchor_from_camera)
         )
         if len(seeds):
-            optimiser.extend(seeds.transformed(anchor_from_camera))
+            optimiser.extend(in_morton_order(seeds.transformed(anchor_from_camera)))
         return len(seeds)
 
     def _means_seen(
@@ -159,26 +220,44 @@ class Mapper:
         means = self.gaussians().means[view.visible]
         return se3.transform_points(se3.inverse(anchor_from_camera), means).astype(np.float32)
 
-    def _novelty(self, frame: Frame, anchor_from_camera: Pose) -> float:
-        return float(self._seeder.need(frame, self.render(anchor_from_camera)).mean())
+    def _novelty(self, frame: Frame, pose: Pose, view: RenderedView | None) -> float:
+        """Share of the pixels that the sub-map does not explain."""
+        return float(self._seeder.need(frame, view or self.render(pose)).mean())
 
-    def _optimise(self) -> tuple[int, float]:
-        """Run the budgeted steps; stop early once the newest keyframe has settled."""
-        first = len(self._keyframes) == 1
-        budget = self._config.anchor_iterations if first else self._config.iterations
+    def _optimise(self, budget: MappingBudget, started: float) -> tuple[int, int, float]:
+        """(steps taken, steps cut for lack of time, last loss of the newest keyframe).
+
+        Ends with the schedule's number of steps, when the newest keyframe has settled, or when the
+        budget is spent.
+        """
+        wanted = self._wanted_iterations(budget)
+        deadline = math.inf if budget.seconds is None else started + budget.seconds
         newest, losses = len(self._keyframes) - 1, []
-        for done in range(1, budget + 1):
+        for done in range(wanted):
+            if done >= budget.least_iterations and self._clock() >= deadline:
+                return done, wanted - done, losses[-1] if losses else math.nan
             index = self._window.choose()
-            keyframe = self._keyframes[index]
-            report = self._active().step(
-                self._camera, keyframe.anchor_from_camera, keyframe.colour, keyframe.depth
-            )
-            self._window.report(index, report.loss)
+            loss = self._step(index)
             if index == newest:
-                losses.append(report.loss)
+                losses.append(loss)
             if _settled(losses, self._config.settle):
-                return done, losses[-1]
-        return budget, losses[-1] if losses else float("nan")
+                return done + 1, 0, losses[-1]
+        return wanted, 0, losses[-1] if losses else math.nan
+
+    def _wanted_iterations(self, budget: MappingBudget) -> int:
+        if budget.iterations is not None:
+            return budget.iterations
+        first = len(self._keyframes) == 1
+        return self._config.anchor_iterations if first else self._config.iterations
+
+    def _step(self, index: int) -> float:
+        """One optimisation step on a keyframe; returns its loss before the step."""
+        keyframe = self._keyframes[index]
+        report = self._active().step(
+            self._camera, keyframe.anchor_from_camera, keyframe.colour, keyframe.depth
+        )
+        self._window.report(index, report.loss)
+        return report.loss
 
     def _prune(self) -> int:
         gaussians = self.gaussians()
