@@ -16,7 +16,8 @@
     │   ├── Overloaded              RESOURCE_EXHAUSTED   a queue of the server is full
     │   ├── DiskFull                RESOURCE_EXHAUSTED   the server's disk has no room left
     │   └── MemoryLow               RESOURCE_EXHAUSTED   the server's memory has no room left
-    ├── Unauthenticated             UNAUTHENTICATED      no token, a wrong one, or one sent in the open
+    ├── Unauthenticated             UNAUTHENTICATED      no token, or a wrong one
+    │   └── PlaintextRefused        UNAUTHENTICATED      what came unencrypted must be encrypted
     ├── PermissionDenied            PERMISSION_DENIED    a caller that is known may not do this
     ├── Unavailable                 UNAVAILABLE          try again later
     ├── DeadlineExceeded            DEADLINE_EXCEEDED    the answer did not come in time
@@ -146,6 +147,10 @@ class MemoryLow(ResourceExhausted):
 class Unauthenticated(MagicError):
     grpc_code = "UNAUTHENTICATED"
     reason = "UNAUTHENTICATED"
+
+
+class PlaintextRefused(Unauthenticated):
+    reason = "PLAINTEXT_REFUSED"
 
 
 class PermissionDenied(MagicError):

@@ -9,21 +9,25 @@ is started again goes on where it was.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import logging
-from collections import deque
-from collections.abc import Awaitable, Callable
+from collections import OrderedDict, deque
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Executor
 
 import numpy as np
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
+from magic_core import logs, tracing
+from magic_core.errors import DiskFull
 from magic_core.wire import names, records
 from magic_server.config import ServerConfig
 from magic_server.graph import SessionGraph, initial_board
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import solve_pose_graph, verify_loop
 from magic_server.loops import SubmapKey, select_candidates
+from magic_server.metrics import Metrics
 from magic_server.places import DescriptorIndex
 from magic_server.posegraph import PoseGraphProblem, PoseGraphSolution
 from magic_server.pruning import without
@@ -32,6 +36,10 @@ from magic_server.tasks import TaskScope
 
 logger = logging.getLogger(__name__)
 
+MAX_TRACES = 10_000
+"""Sub-maps whose traces are remembered; the oldest is forgotten first."""
+ROOM_RETRY_S = 2.0
+"""Pause before work whose result a full disk did not take is done again."""
 QUERY_MARGIN = 8
 """So many times more neighbours are fetched than candidates wanted, since some are left out."""
 
@@ -47,8 +55,10 @@ class SessionCoordinator:
         jobs: JobExecutor,
         threads: Executor,
         config: ServerConfig,
+        metrics: Metrics,
     ) -> None:
         self.session = session
+        self._metrics = metrics
         self.graph = SessionGraph(session.name)
         self.board = initial_board(session.name, None)
         self._store = store
@@ -59,6 +69,8 @@ class SessionCoordinator:
         self._index_lock = asyncio.Lock()
         # Held while the store and what is kept here change together.
         self._editing = asyncio.Lock()
+        # The trace that brought a sub-map; what is made of the sub-map belongs to it.
+        self._traces: OrderedDict[str, str] = OrderedDict()
         self._arrived: deque[Vertex] = deque()
         self._pending: deque[records.LoopCandidate] = deque()
         self._verifying = 0
@@ -91,9 +103,9 @@ class SessionCoordinator:
             self.board.snapshot.loop_count != self.graph.accepted_count
         )
         for worker in range(self._jobs.workers):
-            self._tasks.start(self._verify_for_ever(), name=f"verify {worker}")
-        self._tasks.start(self._search_for_ever(), name="search")
-        self._tasks.start(self._solve_for_ever(), name="solve")
+            self._tasks.start(self._verify_for_ever(), name=f"verify {worker}", detached=True)
+        self._tasks.start(self._search_for_ever(), name="search", detached=True)
+        self._tasks.start(self._solve_for_ever(), name="solve", detached=True)
 
     async def close(self) -> None:
         """Stop working; what was begun is done again after the next start."""
@@ -103,6 +115,10 @@ class SessionCoordinator:
         """Tell of a sub-map that is durable. Returns at once."""
         self.graph.add_vertex(vertex)
         self._arrived.append(vertex)
+        if (parent := tracing.traceparent()) is not None:
+            self._traces[vertex.name] = parent
+            if len(self._traces) > MAX_TRACES:
+                self._traces.popitem(last=False)
         self._dirty = True
         self._notify()
 
@@ -165,6 +181,11 @@ class SessionCoordinator:
         return bool(waiting or self._searching or self._verifying or self._solving)
 
     @property
+    def waiting_searches(self) -> int:
+        """Sub-maps whose loops are still to be looked for."""
+        return len(self._arrived)
+
+    @property
     def pending_loops(self) -> int:
         """Candidates that wait for, or are under, verification."""
         return len(self._pending) + self._verifying
@@ -216,8 +237,12 @@ class SessionCoordinator:
             self._searching = True
             vertex = self._arrived.popleft()
             try:
-                async with self._editing:
-                    await self._search(vertex)
+                with self._about(vertex.name, "search loops"):
+                    async with self._editing:
+                        await self._search(vertex)
+            except DiskFull as error:
+                await self._wait_for_room(error)
+                self._arrived.appendleft(vertex)
             except Exception:
                 # The store does not say "searched": the next start looks again.
                 logger.exception("looking for loops of %s failed", vertex.name)
@@ -233,7 +258,8 @@ class SessionCoordinator:
             hits = await self._in_thread(
                 self._index.query, vertex.descriptor.vector, config.top_k * QUERY_MARGIN
             )
-            await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
+            if vertex.name not in self._index:  # it is there when the disk was full before
+                await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
         chosen = select_candidates(
             _key(vertex.name),
             [(_key(name), similarity) for name, similarity in hits],
@@ -262,15 +288,20 @@ class SessionCoordinator:
             loop = self._pending.popleft()
             self._verifying += 1
             try:
-                settled = await self._verified(loop)
+                with self._about(loop.source, "verify loop", target=loop.target):
+                    settled = await self._verified(loop)
                 async with self._editing:
                     if loop.source not in self.graph or loop.target not in self.graph:
                         continue  # deleted meanwhile
                     await self._store.loops.settle(self.session, settled)
                     self.graph.set_loop(settled)
+                self._metrics.loops.labels(settled.reason).inc()
                 if settled.verdict == "ACCEPTED":
                     self._dirty = True
                     self._notify()
+            except DiskFull as error:
+                await self._wait_for_room(error)
+                self._pending.appendleft(loop)
             except Exception:
                 # The store still says "pending": the next start verifies again.
                 logger.exception("storing the verdict on %s failed", loop.source)
@@ -313,7 +344,11 @@ class SessionCoordinator:
                 continue
             self._dirty, self._solving = False, True
             try:
-                await self._solve()
+                with logs.bound(session=self.session.name), tracing.span("solve pose graph"):
+                    await self._solve()
+            except DiskFull as error:
+                await self._wait_for_room(error)
+                self._dirty = True
             except Exception:
                 # The last solution stays; the next sub-map or loop tries again.
                 logger.exception("solving the pose graph of %s failed", self.session.name)
@@ -346,6 +381,19 @@ class SessionCoordinator:
             len(message.poses),
             len(message.components),
         )
+
+    @contextlib.contextmanager
+    def _about(self, submap: str, doing: str, **attributes: str) -> Iterator[None]:
+        """Logs and traces of a block say which sub-map it is about."""
+        _, agent, index = names.parse_submap(submap)
+        ids = {"session": self.session.name, "agent": agent, "submap": str(index)}
+        parent = self._traces.get(submap)
+        with logs.bound(**ids), tracing.span(doing, parent=parent, **ids, **attributes):
+            yield
+
+    async def _wait_for_room(self, error: DiskFull) -> None:
+        logger.warning("%s: %s", self.session.name, error)
+        await asyncio.sleep(ROOM_RETRY_S)
 
     # Waiting and waking
 

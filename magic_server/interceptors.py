@@ -1,23 +1,24 @@
-"""Errors of the service on their way out: ours as rich statuses, all others as INTERNAL."""
+"""Puts the call desk between gRPC and the servicers."""
 
 from __future__ import annotations
 
-import logging
-import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 import grpc
 import grpc.aio
 
-from magic_core.errors import MagicError
-from magic_core.wire import grpc_status_of
+from magic_server.access import OPEN_TO_ALL
+from magic_server.calls import CallDesk
 
-logger = logging.getLogger(__name__)
+Context = grpc.aio.ServicerContext
 
 
-class ErrorInterceptor(grpc.aio.ServerInterceptor):
-    """Turns what a servicer raises into what a client can read."""
+class CallInterceptor(grpc.aio.ServerInterceptor):
+    """Hands every call to the desk before its servicer sees it; health alone goes past."""
+
+    def __init__(self, desk: CallDesk) -> None:
+        self._desk = desk
 
     async def intercept_service(
         self,
@@ -27,15 +28,43 @@ class ErrorInterceptor(grpc.aio.ServerInterceptor):
         """Wrap the behaviour of the method that is being called."""
         handler: Any = await continuation(handler_call_details)
         method = handler_call_details.method
-        if handler is None or not method.startswith("/magicslam."):
+        if handler is None or method.startswith(OPEN_TO_ALL):
             return handler
         kind, make = _KINDS[handler.request_streaming, handler.response_streaming]
-        wrap = _guarded_stream if handler.response_streaming else _guarded_call
+        wrap = self._stream if handler.response_streaming else self._single
         return make(
-            wrap(getattr(handler, kind), method),
+            wrap(method, getattr(handler, kind), streamed=handler.request_streaming),
             request_deserializer=handler.request_deserializer,
             response_serializer=handler.response_serializer,
         )
+
+    def _single(
+        self, method: str, behaviour: Callable[..., Any], *, streamed: bool
+    ) -> Callable[..., Awaitable[Any]]:
+        """A behaviour with one answer; `streamed` says whether its requests are many."""
+
+        async def single(request: Any, context: Context) -> Any:
+            async with self._desk.handling(method, context, None if streamed else request) as call:
+                given = call.authorised(request) if streamed else request
+                answer = await behaviour(given, context)
+                call.count(answer)
+                return answer
+
+        return single
+
+    def _stream(
+        self, method: str, behaviour: Callable[..., AsyncIterator[Any]], *, streamed: bool
+    ) -> Callable[..., Awaitable[None]]:
+        """A behaviour with many answers. It writes them instead of yielding, so that a caller
+        that goes away ends it at once and in its own task."""
+
+        async def stream(request: Any, context: Context) -> None:
+            async with self._desk.handling(method, context, None if streamed else request) as call:
+                given = call.authorised(request) if streamed else request
+                async for answer in behaviour(given, context):
+                    await context.write(answer)
+
+        return stream
 
 
 _KINDS: dict[tuple[bool, bool], tuple[str, Any]] = {
@@ -44,38 +73,3 @@ _KINDS: dict[tuple[bool, bool], tuple[str, Any]] = {
     (True, False): ("stream_unary", grpc.stream_unary_rpc_method_handler),
     (True, True): ("stream_stream", grpc.stream_stream_rpc_method_handler),
 }
-
-
-def _guarded_call(behaviour: Callable[..., Any], method: str) -> Callable[..., Any]:
-    async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
-        try:
-            return await behaviour(request, context)
-        except Exception as error:
-            await _abort(error, context, method)
-
-    return call
-
-
-def _guarded_stream(behaviour: Callable[..., Any], method: str) -> Callable[..., Any]:
-    async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
-        try:
-            async for answer in behaviour(request, context):
-                yield answer
-        except Exception as error:
-            await _abort(error, context, method)
-
-    return call
-
-
-async def _abort(error: Exception, context: grpc.aio.ServicerContext, method: str) -> None:
-    """End the call with the error's status. Raises, as every abort does."""
-    if isinstance(error, grpc.aio.AbortError):
-        raise error
-    if not isinstance(error, MagicError):
-        incident = uuid.uuid4().hex[:12]
-        logger.error("%s failed, incident %s", method, incident, exc_info=error)
-        await context.abort(grpc.StatusCode.INTERNAL, f"internal error, incident {incident}")
-    else:
-        logger.info("%s refused: %s: %s", method, error.reason, error.message)
-        status = grpc_status_of(error)
-        await context.abort(status.code, status.details or "", status.trailing_metadata or ())

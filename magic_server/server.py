@@ -23,16 +23,25 @@ from magicslam.v1 import session_service_pb2_grpc as session_grpc
 
 from magic_core.errors import Unavailable
 from magic_core.wire import server_options
+from magic_server.access import AccessControl
+from magic_server.audit import AuditLog
+from magic_server.calls import CallDesk
 from magic_server.config import ServerConfig
+from magic_server.drain import Gate
 from magic_server.globalmaps import GlobalMaps
-from magic_server.interceptors import ErrorInterceptor
+from magic_server.interceptors import CallInterceptor
 from magic_server.jobs import ProcessExecutor
 from magic_server.localizing import Localizer
+from magic_server.metrics import Metrics
+from magic_server.probes import ProbePort
+from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
 from magic_server.removal import Removal
+from magic_server.resources import Resources
 from magic_server.servicers import GlobalMapServicer, MappingServicer, SessionServicer
 from magic_server.sessions import Sessions
 from magic_server.store import Store
+from magic_server.tls import server_credentials
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +50,12 @@ SERVICES = tuple(
     for file in (mapping_pb, map_pb, session_pb)
     for service in file.DESCRIPTOR.services_by_name.values()
 )
+
+LAST_ANSWERS_S = 1.0
+"""How long the port stays open for answers once nothing is under way."""
+LIVENESS, READINESS = "liveness", "readiness"
+"""Names for grpc.health.v1: whether the process answers, and whether it takes calls."""
+_READY_NAMES = ("", READINESS, *SERVICES)
 
 
 class Server:
@@ -63,12 +78,36 @@ class Server:
             config.data_dir, self._threads, partial_uploads=config.limits.partial_uploads
         )
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
-        self.sessions = Sessions(self._store, **shared)
+        self.sessions = Sessions(self._store, metrics=self.metrics, **shared)
         self._maps = GlobalMaps(self._store, self.sessions, **shared)
-        self._receiver = SubmapReceiver(self._store, threads=self._threads, limits=config.limits)
         self.localizer = Localizer(self._store, **shared)
         self._health = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
         self._grpc: grpc.aio.Server | None = None
+        self.gate = Gate(
+            max_calls=config.limits.concurrent_calls, max_watches=config.limits.concurrent_watches
+        )
+        self.access = AccessControl(
+            config.access,
+            certificates=config.tls.client_ca is not None,
+            plaintext=config.listen.insecure,
+        )
+        self._resources = Resources(config.data_dir, config.resources, threads=self._threads)
+        self.quotas = Quotas(
+            self._store,
+            config.quotas,
+            resources=self._resources,
+            backlog=self.sessions.backlog,
+            max_backlog=config.limits.session_backlog,
+        )
+        self._audit = AuditLog(
+            config.audit,
+            default=config.data_dir / "audit.jsonl",
+            failures=self.metrics.audit_failures,
+        )
+        self._receiver = SubmapReceiver(
+            self._store, threads=self._threads, limits=config.limits, quotas=self.quotas
+        )
+        self._probes: ProbePort | None = None
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -86,10 +125,13 @@ class Server:
     async def start(self) -> None:
         """Open the store, take up what was left, and serve."""
         try:
+            # Health answers from now on; calls are refused until everything is loaded.
+            await self._listen()
             await self._store.open()
             await self.sessions.start()
             await self._maps.start()
-            await self._listen()
+            self.gate.open()
+            await self._set_ready(True)
         except BaseException:
             await self.stop()
             raise
@@ -97,42 +139,85 @@ class Server:
 
     async def stop(self) -> None:
         """Refuse new calls, let those under way finish, keep everything that was acknowledged."""
+        self.gate.drain()
         if self._grpc is not None:
-            await self._health.enter_graceful_shutdown()
+            # The port stays open for a while, so that callers read why they are refused.
+            await self._set_ready(False)
             self.sessions.dismiss_watchers()
             self._maps.dismiss_waiters()
-            await self._grpc.stop(self.config.listen.stop_grace_s)
+            if not await self.gate.empty(self.config.listen.stop_grace_s):
+                logger.warning("%d calls did not end in time and are cut", self.gate.calls)
+            await self._grpc.stop(LAST_ANSWERS_S)
             self._grpc = None
         await self._receiver.close()
         await self._maps.close()
         await self.sessions.close()
         await self._jobs.close()
         await self._store.close()
+        await self._audit.close()
+        if self._probes is not None:
+            await asyncio.to_thread(self._probes.close)
         self._threads.shutdown(wait=True)
 
     async def _listen(self) -> None:
         listen = self.config.listen
+        desk = CallDesk(
+            access=self.access,
+            gate=self.gate,
+            quotas=self.quotas,
+            resources=self._resources,
+            metrics=self.metrics,
+            audit=self._audit,
+        )
         server = grpc.aio.server(
-            interceptors=[ErrorInterceptor()], options=server_options(listen.transport)
+            interceptors=[CallInterceptor(desk)], options=server_options(listen.transport)
         )
         self._add_services(server)
+        await self._set_ready(False)
+        await self._health.set(LIVENESS, health_pb2.HealthCheckResponse.SERVING)
+        where = f"{listen.host}:{listen.port}"
         try:
-            self.port = server.add_insecure_port(f"{listen.host}:{listen.port}")
+            if self.config.tls.enabled:
+                self.port = server.add_secure_port(where, server_credentials(self.config.tls))
+            else:
+                self.port = server.add_insecure_port(where)
         except RuntimeError as error:
-            where = f"{listen.host}:{listen.port}"
             raise Unavailable(
                 f"cannot listen on {where}; is another server running? Choose another port"
             ) from error
         await server.start()
         self._grpc = server
-        for name in ("", *SERVICES):
-            await self._health.set(name, health_pb2.HealthCheckResponse.SERVING)
+        if self.config.metrics.port is not None:
+            self._observe()
+            self._probes = ProbePort(
+                self.config.metrics, self.metrics.registry, ready=lambda: self.gate.ready
+            )
+
+    def _observe(self) -> None:
+        """Publish what is measured at every scrape, on the scraper's thread."""
+        metrics, gate = self.metrics, self.gate
+        for queue in ("search", "verify"):
+            metrics.watch_queue(queue, lambda q=queue: self.sessions.depths()[q])
+        metrics.watch_queue("jobs", lambda: self._jobs.waiting)
+        metrics.watch_queue("calls", lambda: gate.calls)
+        metrics.watch_queue("watches", lambda: gate.watches)
+        metrics.watch_queue("uploads", lambda: self.quotas.held_submaps)
+        room = self._resources.room
+        metrics.watch("magic_disk_free_bytes", "Free on the store's disk.", lambda: room().disk)
+        metrics.watch("magic_memory_free_bytes", "Memory left.", lambda: room().memory)
+        metrics.watch("magic_ready", "1 while calls are taken.", lambda: float(gate.ready))
+
+    async def _set_ready(self, ready: bool) -> None:
+        states = health_pb2.HealthCheckResponse
+        for name in _READY_NAMES:
+            await self._health.set(name, states.SERVING if ready else states.NOT_SERVING)
 
     def _add_services(self, server: grpc.aio.Server) -> None:
         mapping = MappingServicer(
             self._store,
             self.sessions,
             receiver=self._receiver,
+            quotas=self.quotas,
             localizer=self.localizer,
             threads=self._threads,
             config=self.config,

@@ -11,6 +11,7 @@ from magic_core.errors import MagicError
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
+from magic_server.metrics import Metrics
 from magic_server.places import DescriptorIndex
 from magic_server.store import AgentRow, SessionRow, Store, Vertex
 
@@ -19,12 +20,19 @@ class Sessions:
     """One coordinator per session, begun when the server starts or the session does."""
 
     def __init__(
-        self, store: Store, *, jobs: JobExecutor, threads: Executor, config: ServerConfig
+        self,
+        store: Store,
+        *,
+        jobs: JobExecutor,
+        threads: Executor,
+        config: ServerConfig,
+        metrics: Metrics,
     ) -> None:
         self._store = store
         self._jobs = jobs
         self._threads = threads
         self._config = config
+        self._metrics = metrics
         self._coordinators: dict[str, SessionCoordinator] = {}
         self._lock = asyncio.Lock()
 
@@ -34,6 +42,19 @@ class Sessions:
         await asyncio.get_running_loop().run_in_executor(self._threads, DescriptorIndex, 1)
         for session in await self._store.agents.sessions():
             await self.coordinator(session)
+
+    def backlog(self, session: str) -> int:
+        """Searches and verifications that wait in a session."""
+        found = self._coordinators.get(session)
+        return 0 if found is None else found.waiting_searches + found.pending_loops
+
+    def depths(self) -> dict[str, int]:
+        """What waits in all sessions together, by queue. May be called from any thread."""
+        known = list(self._coordinators.values())
+        return {
+            "search": sum(c.waiting_searches for c in known),
+            "verify": sum(c.pending_loops for c in known),
+        }
 
     def dismiss_watchers(self) -> None:
         """End the streams that would otherwise go on for ever."""
@@ -58,6 +79,7 @@ class Sessions:
                     jobs=self._jobs,
                     threads=self._threads,
                     config=self._config,
+                    metrics=self._metrics,
                 )
                 await found.start()
                 self._coordinators[session.name] = found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import logging
 from collections.abc import Coroutine
 from typing import Any, TypeVar
@@ -19,12 +20,18 @@ class TaskScope:
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closed = False
 
-    def start(self, work: Coroutine[Any, Any, T], *, name: str) -> asyncio.Task[T]:
-        """Run a coroutine in the background."""
+    def start(
+        self, work: Coroutine[Any, Any, T], *, name: str, detached: bool = False
+    ) -> asyncio.Task[T]:
+        """Run a coroutine in the background.
+
+        A detached one does not carry on the trace and the log ids of the call that began it.
+        """
         if self._closed:
             work.close()
             raise asyncio.CancelledError(f"{self._owner} is closed")
-        task = asyncio.create_task(work, name=f"{self._owner}: {name}")
+        context = contextvars.Context() if detached else None
+        task = asyncio.create_task(work, name=f"{self._owner}: {name}", context=context)
         self._tasks.add(task)
         task.add_done_callback(self._forget)
         return task

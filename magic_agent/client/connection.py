@@ -12,12 +12,20 @@ from typing import Any, Self, TypeVar
 
 import grpc
 import grpc.aio
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 from magicslam.v1 import global_map_service_pb2_grpc as map_grpc
 from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 
 from magic_core.errors import MagicError, Unavailable
-from magic_core.wire import SubmapEncoding, Transport, client_options, error_of
+from magic_core.wire import (
+    ClientCredentials,
+    SubmapEncoding,
+    Transport,
+    client_options,
+    error_of,
+    open_channel,
+)
 
 _T = TypeVar("_T")
 
@@ -43,9 +51,13 @@ class ClientConfig:
     backoff_s: float = 0.25
     """Wait before the second attempt, seconds; doubles each time, with jitter."""
     max_backoff_s: float = 10.0
-    """Longest wait between attempts, seconds."""
+    """Longest wait between attempts, seconds, unless the server asks for a longer one."""
+    max_asked_s: float = 30.0
+    """A server that asks for a longer wait than this has its refusal raised at once, seconds."""
     encoding: SubmapEncoding = field(default_factory=SubmapEncoding)
     """How sub-maps become bytes."""
+    credentials: ClientCredentials = field(default_factory=ClientCredentials)
+    """Encryption and token."""
     transport: Transport = field(default_factory=Transport)
     """Keepalive and message limits."""
 
@@ -56,10 +68,11 @@ class Connection:
     def __init__(self, target: str, config: ClientConfig = ClientConfig()) -> None:
         self.target = target
         self.config = config
-        self._channel = grpc.aio.insecure_channel(target, client_options(config.transport))
-        self.mapping_stub = mapping_grpc.MappingServiceStub(self._channel)
-        self.map_stub = map_grpc.GlobalMapServiceStub(self._channel)
-        self.session_stub = session_grpc.SessionServiceStub(self._channel)
+        opened: Any = open_channel(target, config.credentials, client_options(config.transport))
+        self._channel: grpc.aio.Channel = opened.channel
+        self.mapping_stub = mapping_grpc.MappingServiceStub(opened)
+        self.map_stub = map_grpc.GlobalMapServiceStub(opened)
+        self.session_stub = session_grpc.SessionServiceStub(opened)
 
     async def __aenter__(self) -> Self:
         await self.connect()
@@ -81,8 +94,19 @@ class Connection:
         except TimeoutError as error:
             waited = self.config.connect_timeout_s
             raise Unavailable(
-                f"no server answers at {self.target} within {waited:g} s; is `magic serve` running?"
+                f"no server answers at {self.target} within {waited:g} s; is `magic serve` "
+                f"running, with the encryption that this client has? {await self._diagnosis()}"
             ) from error
+
+    async def _diagnosis(self) -> str:
+        """What gRPC says of the connection: a refused port, or a certificate and what is wrong."""
+        try:
+            await health_pb2_grpc.HealthStub(self._channel).Check(
+                health_pb2.HealthCheckRequest(), timeout=2.0
+            )
+        except grpc.aio.AioRpcError as failure:
+            return f"({failure.details()})"
+        return ""
 
     async def close(self) -> None:
         """Close the connection; calls under way are cancelled."""
@@ -113,11 +137,20 @@ class Connection:
             failures += 1
 
     async def pause_or_raise(self, error: MagicError, failures: int) -> None:
-        """Sleep before the next attempt, or raise when trying again is no use."""
-        if not isinstance(error, Unavailable) or failures + 1 >= self.config.attempts:
+        """Sleep before the next attempt, or raise when trying again is no use.
+
+        A server that refuses for now says how long, and is left alone for that.
+        """
+        asked_s = error.retry_after_s
+        passing = isinstance(error, Unavailable) or asked_s is not None
+        if not passing or failures + 1 >= self.config.attempts:
+            raise error
+        if asked_s is not None and asked_s > self.config.max_asked_s:
             raise error
         pause = min(self.config.backoff_s * 2**failures, self.config.max_backoff_s)
-        await asyncio.sleep(pause * random.uniform(0.5, 1.0))
+        pause *= random.uniform(0.5, 1.0)
+        # A little later than asked: of many who wait, not all come back in the same instant.
+        await asyncio.sleep(max(pause, (asked_s or 0.0) * random.uniform(1.0, 1.2)))
 
     async def pages(self, method: Callable[..., Awaitable[_T]], request: Any) -> AsyncIterator[_T]:
         """Every page of a list call."""

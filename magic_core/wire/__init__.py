@@ -2,6 +2,7 @@
 
 from magic_core.wire.channel import Transport, client_options, server_options
 from magic_core.wire.chunks import MAX_CHUNK_BYTES, ChunkCursor, check_chunk, chunks_of
+from magic_core.wire.credentials import AnnotatedChannel, ClientCredentials, open_channel
 from magic_core.wire.errors import error_of, grpc_status_of, status_of
 from magic_core.wire.header_check import SubmapLimits, check_header
 from magic_core.wire.submap import (
@@ -14,7 +15,9 @@ from magic_core.wire.submap import (
 
 __all__ = [
     "MAX_CHUNK_BYTES",
+    "AnnotatedChannel",
     "ChunkCursor",
+    "ClientCredentials",
     "EncodedSubmap",
     "SubmapEncoding",
     "SubmapLimits",
@@ -28,6 +31,7 @@ __all__ = [
     "encode_submap",
     "error_of",
     "grpc_status_of",
+    "open_channel",
     "server_options",
     "status_of",
 ]

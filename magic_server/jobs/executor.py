@@ -10,17 +10,24 @@ import asyncio
 import logging
 import multiprocessing
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
+from magic_core import tracing
 from magic_core.errors import ConfigError, Unavailable
-from magic_server.jobs.worker import prepare_worker
+from magic_core.tracing import TracingConfig
+from magic_server.jobs.worker import JobDone, prepare_worker, run_job
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
+
+JobObserver = Callable[[str, str, float, float], None]
+"""Called with a job's name, its outcome (ok, failed or died), and the seconds that it waited for a
+worker and that it ran; both are 0 where they are not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +68,17 @@ class JobExecutor(Protocol):
 class ProcessExecutor:
     """Jobs in spawned processes on this machine; a job whose worker dies is tried once more."""
 
-    def __init__(self, config: JobConfig = JobConfig()) -> None:
+    def __init__(
+        self,
+        config: JobConfig = JobConfig(),
+        *,
+        trace: TracingConfig | None = None,
+        observer: JobObserver = lambda job, outcome, waited_s, ran_s: None,
+    ) -> None:
         self._config = config
+        self._trace = trace or TracingConfig()
+        self._observer = observer
+        self._open = 0
         self._pool = self._new_pool()
         self._lock = threading.Lock()
         self._closed = False
@@ -72,22 +88,44 @@ class ProcessExecutor:
         """How many jobs run at once."""
         return self._config.workers
 
+    @property
+    def waiting(self) -> int:
+        """Jobs that wait for a worker."""
+        return max(0, self._open - self._config.workers)
+
     async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
         """The function's result, or the error it raised. Unavailable when the worker died twice."""
+        name = getattr(function, "__name__", str(function))
+        self._open += 1
+        try:
+            with tracing.span(f"job {name}"):
+                return await self._run(name, function, *arguments)
+        finally:
+            self._open -= 1
+
+    async def _run(self, name: str, function: Callable[..., T], *arguments: Any) -> T:
+        parent = tracing.traceparent()
         for last in (False, True):
             pool = self._pool
+            begun = time.perf_counter()
             try:
                 # Submitting may start a process, which takes longer than the event loop can spare.
-                future = await asyncio.to_thread(pool.submit, function, *arguments)
-                return await _result(future)
+                future = await asyncio.to_thread(pool.submit, run_job, parent, function, *arguments)
+                done: JobDone[T] = await _result(future)
+                waited_s = time.perf_counter() - begun - done.seconds
+                self._observer(name, "ok", max(0.0, waited_s), done.seconds)
+                return done.result
             except BrokenProcessPool as error:
                 if self._closed:
                     raise Unavailable("the server is stopping") from error
                 self._replace(pool)
-                name = getattr(function, "__name__", str(function))
                 logger.warning("a worker died during %s", name)
+                self._observer(name, "died", 0.0, 0.0)
                 if last:
                     raise Unavailable(f"workers died twice during {name}") from error
+            except Exception:
+                self._observer(name, "failed", 0.0, 0.0)
+                raise
         raise AssertionError("unreachable")
 
     async def close(self) -> None:
@@ -101,7 +139,7 @@ class ProcessExecutor:
             config.workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=prepare_worker,
-            initargs=(config.threads_per_worker, config.niceness),
+            initargs=(config.threads_per_worker, config.niceness, self._trace),
         )
 
     def _replace(self, broken: ProcessPoolExecutor) -> None:

@@ -20,6 +20,7 @@ from magic_core.wire.submap import decode_trajectory
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.localizing import Localizer
+from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.sessions import Sessions
@@ -39,6 +40,7 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         *,
         receiver: SubmapReceiver,
         localizer: Localizer,
+        quotas: Quotas,
         threads: Executor,
         config: ServerConfig,
     ) -> None:
@@ -46,6 +48,7 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         self._sessions = sessions
         self._receiver = receiver
         self._localizer = localizer
+        self._quotas = quotas
         self._threads = threads
         self._config = config
 
@@ -54,7 +57,9 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
     ) -> mapping_pb.RegisterAgentResponse:
         session, agent = names.parse_agent(request.agent, field="agent")
         _check_registration(request, self._config.limits.submap.max_descriptor_dimension)
-        row, resumed = await self._store.agents.register(
+        await self._quotas.registration(session, agent)
+        asked = Asked.of(request, request_id=request.request_id, now=time.time())
+        entered = await self._store.agents.register(
             session,
             agent,
             model_id=request.descriptor_model_id,
@@ -86,11 +91,6 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             duplicate=received.duplicate,
         )
 
-    async def FinishAgent(  # noqa: N802
-        self, request: mapping_pb.FinishAgentRequest, context: Context
-    ) -> mapping_pb.FinishAgentResponse:
-        session, agent = names.parse_agent(request.agent, field="agent")
-        check_request_id(request.request_id)
     async def ResumeUpload(  # noqa: N802
         self, request: mapping_pb.ResumeUploadRequest, context: Context
     ) -> mapping_pb.ResumeUploadResponse:
@@ -104,6 +104,11 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
             stored=found.stored,
         )
 
+    async def FinishAgent(  # noqa: N802
+        self, request: mapping_pb.FinishAgentRequest, context: Context
+    ) -> mapping_pb.FinishAgentResponse:
+        session, agent = names.parse_agent(request.agent, field="agent")
+        check_request_id(request.request_id)
         asked = Asked.of(request, request_id=request.request_id, now=time.time())
         count = await self._store.agents.finish(session, agent, asked=asked)
         return mapping_pb.FinishAgentResponse(agent=request.agent, submap_count=count)

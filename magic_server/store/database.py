@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -10,10 +11,15 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.ext.asyncio import AsyncConnection, create_async_engine
 
-from magic_core.errors import WrongState
+from magic_core.errors import DiskFull, WrongState
 from magic_server.store import schema
+from magic_server.store.blobs import DISK_RETRY_S
+
+# A full disk shows as either, depending on which file had to grow.
+_NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_SHMSIZE)
 
 
 class Database:
@@ -51,9 +57,18 @@ class Database:
 
     @asynccontextmanager
     async def write(self) -> AsyncIterator[AsyncConnection]:
-        """One transaction: durable when the block ends, undone when it raises."""
-        async with self._write_lock, self._engine.begin() as connection:
-            yield connection
+        """One transaction: durable when the block ends, undone when it raises.
+
+        Raises DiskFull when the disk has no room for it.
+        """
+        try:
+            async with self._write_lock, self._engine.begin() as connection:
+                yield connection
+        except OperationalError as error:
+            if getattr(error.orig, "sqlite_errorcode", None) in _NO_ROOM:
+                message = "the server's disk is full; try again once there is room"
+                raise DiskFull(message, retry_after_s=DISK_RETRY_S) from error
+            raise
 
 
 def _prepare_connection(connection: Any, _record: Any) -> None:

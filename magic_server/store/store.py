@@ -28,6 +28,9 @@ from magic_server.store.maps import MapTable, NewMap
 from magic_server.store.rows import AgentRow, NewSubmap, SessionRow
 from magic_server.store.schema import map_files, submap_blobs
 from magic_server.store.submaps import FirstAnswer, SubmapTable
+from magic_server.store.uploads import UploadFolder
+from magic_server.store.usage import UsageTable
+from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
 
@@ -44,16 +47,17 @@ class Store:
     ) -> None:
         self.folder = folder
         self.blobs = BlobFolder(folder)
+        self.uploads = UploadFolder(folder)
         self._threads = threads
+        self._partial_uploads = partial_uploads or PartialUploadLimits()
         self._database = Database(folder / "magic.sqlite")
         self._commit_lock = asyncio.Lock()
-        self.uploads = UploadFolder(folder)
         self._lock_file: int | None = None
-        self._partial_uploads = partial_uploads or PartialUploadLimits()
         self.agents = AgentTable(self._database)
         self.submaps = SubmapTable(self._database, self.blobs)
         self.loops = LoopTable(self._database)
         self.maps = MapTable(self._database)
+        self.usage = UsageTable(self._database)
         self.deletions = Deletions(
             self._database, self.blobs, lock=self._commit_lock, threads=threads
         )
@@ -79,14 +83,14 @@ class Store:
         if removed:
             logger.info("removed %d blobs that nothing referred to", removed)
 
-    async def close(self) -> None:
-        """Close the database and give the folder free."""
-        await self._database.close()
-        if self._lock_file is not None:
     def _open_folders(self) -> None:
         self.blobs.open()
         self.uploads.open(self._partial_uploads, now=time.time())
 
+    async def close(self) -> None:
+        """Close the database and give the folder free."""
+        await self._database.close()
+        if self._lock_file is not None:
             os.close(self._lock_file)
             self._lock_file = None
 

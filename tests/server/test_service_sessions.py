@@ -243,9 +243,9 @@ async def test_a_taken_port_is_named(server: Server, server_config: ServerConfig
 
 
 def test_plain_text_stays_on_this_machine_unless_told() -> None:
-    with pytest.raises(ConfigError, match="insecure_bind"):
-        ListenConfig(host="0.0.0.0")
-    assert ListenConfig(host="0.0.0.0", insecure_bind=True).host == "0.0.0.0"
+    with pytest.raises(ConfigError, match=r"tls\.certificate"):
+        ServerConfig(listen=ListenConfig(host="0.0.0.0"))
+    assert ServerConfig(listen=ListenConfig(host="0.0.0.0", insecure=True)).listen.insecure
 
 
 async def test_an_unexpected_failure_is_internal_and_tells_no_secrets(
