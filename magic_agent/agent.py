@@ -2,7 +2,8 @@
 
 The event loop only moves things: frames are read, tracked, mapped and encoded on executors. A slow
 or absent server never stops tracking, and a slow tracker holds back the reader through a bounded
-queue (or, with `rate_hz`, makes it drop frames, as a live camera would).
+queue. With `rate_hz` the source is a live camera that does not wait: mapping gives way first, then
+frames are dropped (see `pace`), and the tally says what was left out.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from magic_agent.client import MagicClient
 from magic_agent.config import AgentConfig
+from magic_agent.pace import Pace
 from magic_agent.places import DescriptorModel
 from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.spool import Spool
@@ -28,6 +30,7 @@ from magic_agent.uplink import Uplink
 from magic_core.data import Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
 from magic_core.geometry import se3
+from magic_core.render import warm_up
 from magic_core.submap import Submap
 from magic_core.wire import names
 from magic_core.wire.records import CorrectedPose, PoseSnapshot, SubmapReceipt
@@ -66,6 +69,9 @@ class Agent:
         self._spool = Spool(folder / "spool")
         self._stopping = asyncio.Event()
         self._frames: asyncio.Queue[Frame | None] = asyncio.Queue(config.queue_frames)
+        self._pace = (
+            Pace(config.rate_hz, queue_frames=config.queue_frames) if config.rate_hz else None
+        )
         self._slam_thread = ThreadPoolExecutor(1, f"slam-{name}")
         self._io_threads = ThreadPoolExecutor(2, f"io-{name}")
         self.world_from_camera: NDArray[np.float64] = se3.identity()
@@ -130,12 +136,13 @@ class Agent:
 
     async def _read_frames(self) -> None:
         loop = asyncio.get_running_loop()
-        start = loop.time()
+        if self._pace is not None:  # a live camera does not wait for kernels to be loaded
+            await loop.run_in_executor(self._slam_thread, warm_up)
         for number in range(len(self._source)):
             if self._stopping.is_set():
                 break
-            if self._config.rate_hz:
-                await asyncio.sleep(max(0.0, start + number / self._config.rate_hz - loop.time()))
+            if self._pace is not None:
+                await asyncio.sleep(self._pace.wait_s(number))
                 if self._frames.full():
                     self.tally.dropped_frames += 1
                     continue
@@ -146,11 +153,20 @@ class Agent:
     async def _process_frames(self, slam: LocalSlam, uplink: Uplink) -> None:
         loop = asyncio.get_running_loop()
         while (frame := await self._frames.get()) is not None:
-            result = await loop.run_in_executor(self._slam_thread, slam.process, frame)
+            result = await loop.run_in_executor(self._slam_thread, self._process, slam, frame)
             self._count(result)
             await self._hand_over(result.finished, uplink)
         last = await loop.run_in_executor(self._slam_thread, slam.finish)
         await self._hand_over(last, uplink)
+
+    def _process(self, slam: LocalSlam, frame: Frame) -> FrameResult:
+        """Take in one frame; from a live camera, with no more mapping than there is time for."""
+        if self._pace is None:
+            return slam.process(frame)
+        self.tally.late_ms.append(round(1e3 * self._pace.late_s(frame.index), 3))
+        result = slam.process(frame, mapping_s=self._pace.mapping_s(frame.index))
+        self._pace.note_tracking(1e-3 * result.tracking_ms)
+        return result
 
     async def _hand_over(self, submap: Submap | None, uplink: Uplink) -> None:
         if submap is not None:
@@ -164,7 +180,12 @@ class Agent:
             self.world_from_camera = correction.world_from_anchor @ result.anchor_from_camera
         self._observer(
             "frame",
-            {"frames": self.tally.frames, "of": len(self._source), "lost": self.tally.lost_frames},
+            {
+                "frames": self.tally.frames,
+                "of": len(self._source),
+                "lost": self.tally.lost_frames,
+                "dropped": self.tally.dropped_frames,
+            },
         )
 
     def _on_receipt(self, index: int, receipt: SubmapReceipt) -> None:

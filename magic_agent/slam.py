@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_agent.mapping.mapper import Mapper
+from magic_agent.mapping.mapper import Mapper, MappingBudget, MappingReport
 from magic_agent.odometry import ActiveSubmap, hand_over_edge
 from magic_agent.slam_config import SlamConfig
 from magic_agent.tracking import Tracker, TrackingResult
@@ -25,12 +25,16 @@ from magic_agent.tracking.refinement import CloudView, ReferenceView
 from magic_core.data import Frame
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
+from magic_core.render import RenderedView
 from magic_core.submap import Descriptor, OdometryEdge, Submap
 
 log = logging.getLogger(__name__)
 
 Pose = NDArray[np.float64]
 Describe = Callable[[NDArray[np.uint8]], Descriptor]
+
+_EVEN_STEPS = 1e-3  # relative difference of two steps in time that is the clock's
+_LONGEST_STEPS = 5.0  # a motion is believed to go on this many steps at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,10 @@ class FrameResult:
     """The sub-map that this frame closed."""
     tracked: TrackingResult | None = None
     """What the tracker said; None for the first frame of a chain."""
+    mapped: MappingReport | None = None
+    """What mapping did; None where the frame is no keyframe."""
+    skipped_keyframe: bool = False
+    """The frame should have become a keyframe, and there was no time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +88,17 @@ class LocalSlam:
         self._camera, self._config, self._clock = camera, config, clock
         self._session, self._agent, self._describe = session, agent, describe
         threads = config.threads or None
-        self._mapper = Mapper(camera, config.mapping, threads=threads, seed=config.seed)
+        self._mapper = Mapper(
+            camera, config.mapping, threads=threads, seed=config.seed, clock=clock
+        )
         self._tracker = Tracker(camera, config.tracking)
         self._next_index = first_submap_index
         self._prior = world_from_anchor_prior
         self._active: ActiveSubmap | None = None
         self._last: _Tracked | None = None
         self._before_last: Pose | None = None
+        self._last_step_s = 0.0
+        self._seen: RenderedView | None = None
         self._lost_in_a_row = 0
 
     @property
@@ -94,19 +106,24 @@ class LocalSlam:
         """The mapper, for viewers and evaluation; read only."""
         return self._mapper
 
-    def process(self, frame: Frame, *, mapping: bool = True) -> FrameResult:
-        """Take in the next frame. With `mapping=False` it is tracked but never becomes a keyframe,
-        unless a sub-map ends with it: the way to catch up with a live camera."""
+    def process(self, frame: Frame, *, mapping_s: float | None = None) -> FrameResult:
+        """Take in the next frame.
+
+        mapping_s: the time that mapping may take, None for as long as the schedule asks. Where it
+        is too short, the frame becomes a keyframe only if the sub-map no longer explains it, or
+        ends with it: the way to keep up with a live camera.
+        """
         if self._active is None:
-            return self._first(frame)
+            return self._first(frame, mapping_s)
+        self._seen = None
         started = self._clock()
         tracked = self._track(frame, self._active)
         if tracked.lost:
             tracked = self._relocalised(frame) or tracked
         tracking_ms = 1e3 * (self._clock() - started)
         if tracked.lost:
-            return self._on_lost(frame, self._active, tracked, tracking_ms)
-        return self._on_tracked(frame, self._active, tracked, tracking_ms, mapping)
+            return self._on_lost(frame, self._active, tracked, tracking_ms, mapping_s)
+        return self._on_tracked(frame, self._active, tracked, tracking_ms, mapping_s)
 
     def finish(self) -> Submap | None:
         """Close the last sub-map, all its Gaussians included; None where there is none."""
@@ -116,18 +133,18 @@ class LocalSlam:
         self._active = None
         return finished
 
-    def _first(self, frame: Frame) -> FrameResult:
+    def _first(self, frame: Frame, mapping_s: float | None) -> FrameResult:
         """The first frame of all, or the first after a lost stretch: the anchor of a new chain."""
         if not self._usable(frame):
             return self._result(frame, self._next_index, se3.identity(), lost=True)
         started = self._clock()
-        self._begin(frame, odometry=None)
+        mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
         return self._result(
             frame,
             self._next_index - 1,
             se3.identity(),
             mapping_ms=1e3 * (self._clock() - started),
-            is_keyframe=True,
+            mapped=mapped,
         )
 
     def _track(self, frame: Frame, active: ActiveSubmap) -> TrackingResult:
@@ -137,7 +154,7 @@ class LocalSlam:
             frame,
             self._last.frame,
             anchor_from_previous=self._last.anchor_from_camera,
-            anchor_from_before_previous=None if self._lost_in_a_row else self._before_last,
+            anchor_from_before_previous=self._pose_one_step_back(frame),
             reference=self._reference(),
         )
 
@@ -146,13 +163,31 @@ class LocalSlam:
         if self._config.tracking.solver == "adam":
             threads = self._config.threads or None
             return CloudView(self._mapper.gaussians(), self._camera, threads=threads)
-        return self._mapper.render
+        return self._look
+
+    def _look(self, anchor_from_camera: Pose) -> RenderedView:
+        """The active sub-map from a pose; mapping looks at the last such view again."""
+        self._seen = self._mapper.render(anchor_from_camera)
+        return self._seen
+
+    def _pose_one_step_back(self, frame: Frame) -> Pose | None:
+        """The pose before the last, put where a steady motion would have had it as long before the
+        last frame as this one comes after: frames may be missing between them."""
+        if self._before_last is None or self._last is None or self._lost_in_a_row:
+            return None
+        steps = (frame.timestamp_s - self._last.frame.timestamp_s) / self._last_step_s
+        if abs(steps - 1.0) < _EVEN_STEPS:
+            return self._before_last
+        last = self._last.anchor_from_camera
+        motion = se3.log(se3.inverse(self._before_last) @ last)
+        return last @ se3.exp(-min(steps, _LONGEST_STEPS) * motion)
 
     def _relocalised(self, frame: Frame) -> TrackingResult | None:
         """The pose of a lost frame found from the active sub-map's keyframes, if it is there."""
         if not self._usable(frame):
             return None
         found = self._tracker.relocalise(frame, self._mapper.keyframes, reference=self._reference())
+        self._seen = None  # The last view that was tried need not be the right one.
         if found is not None:
             log.info("agent %s: frame %d found again in its sub-map", self._agent, frame.index)
             self._tracker.reset()
@@ -163,6 +198,8 @@ class LocalSlam:
         # Over a lost stretch the step between the two poses is no frame-to-frame motion.
         steady = self._last is not None and self._lost_in_a_row == 0
         self._before_last = self._last.anchor_from_camera if self._last and steady else None
+        if self._last is not None:
+            self._last_step_s = frame.timestamp_s - self._last.frame.timestamp_s
         self._last = _Tracked(frame, anchor_from_camera)
         self._lost_in_a_row = 0
 
@@ -172,34 +209,51 @@ class LocalSlam:
         active: ActiveSubmap,
         tracked: TrackingResult,
         tracking_ms: float,
-        mapping: bool,
+        mapping_s: float | None,
     ) -> FrameResult:
         pose = tracked.anchor_from_camera
         self._remember(frame, pose)
         started = self._clock()
         if active.is_due(pose, self._config.submap) and self._usable(frame):
             edge = hand_over_edge(active.index, pose, tracked.information, self._config.submap)
-            finished = self._hand_over(frame, active, edge)
-            pose, is_keyframe = se3.identity(), True
+            finished, mapped = self._hand_over(frame, active, edge, mapping_s)
+            pose, skipped = se3.identity(), False
         else:
             finished = None
             active.append(frame, pose, lost=False)
-            is_keyframe = mapping and self._usable(frame) and self._mapper.wants(frame, pose)
-            if is_keyframe:
-                self._mapper.insert(frame, pose)
+            mapped, skipped = self._map(frame, pose, mapping_s)
         return self._result(
             frame,
             self._next_index - 1,
             pose,
             tracking_ms=tracking_ms,
             mapping_ms=1e3 * (self._clock() - started),
-            is_keyframe=is_keyframe,
             finished=finished,
             tracked=tracked,
+            mapped=mapped,
+            skipped_keyframe=skipped,
         )
 
+    def _map(
+        self, frame: Frame, anchor_from_camera: Pose, mapping_s: float | None
+    ) -> tuple[MappingReport | None, bool]:
+        """(what mapping did with a tracked frame, whether it left out a keyframe)."""
+        mapper, view = self._mapper, self._seen
+        if not self._usable(frame) or not mapper.wants(frame, anchor_from_camera, view=view):
+            return None, False
+        late = mapping_s is not None and mapping_s < mapper.least_s
+        if late and not mapper.lacks(frame, anchor_from_camera, view=view):
+            return None, True
+        budget = MappingBudget.within(mapping_s, mapper.config)
+        return mapper.insert(frame, anchor_from_camera, budget=budget), False
+
     def _on_lost(
-        self, frame: Frame, active: ActiveSubmap, tracked: TrackingResult, tracking_ms: float
+        self,
+        frame: Frame,
+        active: ActiveSubmap,
+        tracked: TrackingResult,
+        tracking_ms: float,
+        mapping_s: float | None,
     ) -> FrameResult:
         """Hold the last pose for a while; then close the sub-map and start one without odometry."""
         self._lost_in_a_row += 1
@@ -221,26 +275,28 @@ class LocalSlam:
         started = self._clock()
         finished = self._submap(active, self._mapper.gaussians())
         self._tracker.reset()
-        self._begin(frame, odometry=None)
+        mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
         return self._result(
             frame,
             self._next_index - 1,
             se3.identity(),
             tracking_ms=tracking_ms,
             mapping_ms=1e3 * (self._clock() - started),
-            is_keyframe=True,
             finished=finished,
             tracked=tracked,
+            mapped=mapped,
         )
 
-    def _hand_over(self, frame: Frame, active: ActiveSubmap, edge: OdometryEdge) -> Submap:
+    def _hand_over(
+        self, frame: Frame, active: ActiveSubmap, edge: OdometryEdge, mapping_s: float | None
+    ) -> tuple[Submap, MappingReport]:
         sent, kept = self._mapper.split(edge.previous_from_anchor)
         finished = self._submap(active, sent)
         before = self._before_last
-        self._begin(frame, odometry=edge, carried=kept)
+        mapped = self._begin(frame, odometry=edge, carried=kept, mapping_s=mapping_s)
         if before is not None:  # the motion goes on across the seam
             self._before_last = se3.inverse(edge.previous_from_anchor) @ before
-        return finished
+        return finished, mapped
 
     def _begin(
         self,
@@ -248,7 +304,8 @@ class LocalSlam:
         *,
         odometry: OdometryEdge | None,
         carried: GaussianCloud | None = None,
-    ) -> None:
+        mapping_s: float | None,
+    ) -> MappingReport:
         """Start the next sub-map with this frame as anchor."""
         self._active = ActiveSubmap(
             index=self._next_index,
@@ -261,7 +318,8 @@ class LocalSlam:
         self._lost_in_a_row = 0
         self._next_index += 1
         self._prior = None  # It places the first anchor alone; the rest follows from odometry.
-        self._mapper.begin(frame, carried=carried)
+        budget = MappingBudget.within(mapping_s, self._mapper.config)
+        return self._mapper.begin(frame, carried=carried, budget=budget)
 
     def _submap(self, active: ActiveSubmap, gaussians: GaussianCloud) -> Submap:
         return Submap(
@@ -294,9 +352,10 @@ class LocalSlam:
         tracking_ms: float = 0.0,
         mapping_ms: float = 0.0,
         lost: bool = False,
-        is_keyframe: bool = False,
         finished: Submap | None = None,
         tracked: TrackingResult | None = None,
+        mapped: MappingReport | None = None,
+        skipped_keyframe: bool = False,
     ) -> FrameResult:
         return FrameResult(
             frame_index=frame.index,
@@ -306,7 +365,9 @@ class LocalSlam:
             tracking_ms=tracking_ms,
             mapping_ms=mapping_ms,
             lost=lost,
-            is_keyframe=is_keyframe,
+            is_keyframe=mapped is not None,
             finished=finished,
             tracked=tracked,
+            mapped=mapped,
+            skipped_keyframe=skipped_keyframe,
         )

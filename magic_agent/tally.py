@@ -25,6 +25,14 @@ class Tally:
     lost_frames: int = 0
     dropped_frames: int = 0
     """Frames skipped because the source ran in real time and the agent could not keep up."""
+    skipped_keyframes: int = 0
+    """Keyframes that were left out for the same reason."""
+    mapping_steps: int = 0
+    """Optimisation steps taken."""
+    cut_mapping_steps: int = 0
+    """Optimisation steps of the schedule that keyframes did not get for the same reason."""
+    late_ms: list[float] = field(default_factory=list)
+    """Per frame of a live source, the time from when it was due to its tracking."""
     acknowledged: int = 0
     """Sub-maps that the server has said are durable."""
     revisions_seen: int = 0
@@ -46,8 +54,11 @@ class Tally:
         self.lost_frames += int(result.lost)
         self.tracking_ms.append(round(result.tracking_ms, 3))
         self.mapping_ms.append(round(result.mapping_ms, 3))
-        if result.is_keyframe:
+        self.skipped_keyframes += int(result.skipped_keyframe)
+        if result.mapped is not None:
             self.keyframes.append(result.frame_index)
+            self.mapping_steps += result.mapped.iterations
+            self.cut_mapping_steps += result.mapped.cut_iterations
 
     def add_submap(self, submap: Submap) -> None:
         """Append a finished sub-map's frames to the trajectory in the agent's odometry frame."""
@@ -84,6 +95,11 @@ class Tally:
             peak_rss_bytes=peak_rss_bytes(),
             wall_s=round(self.wall_s, 3),
             submap_first_frames=tuple(self.first_frames),
+            dropped_frames=self.dropped_frames,
+            skipped_keyframes=self.skipped_keyframes,
+            mapping_steps=self.mapping_steps,
+            cut_mapping_steps=self.cut_mapping_steps,
+            late_ms=tuple(self.late_ms),
         )
 
 

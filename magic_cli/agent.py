@@ -99,6 +99,8 @@ async def run_agent(command: AgentCommand) -> dict:
         "frames": tally.frames,
         "lost_frames": tally.lost_frames,
         "dropped_frames": tally.dropped_frames,
+        "skipped_keyframes": tally.skipped_keyframes,
+        "cut_mapping_steps": tally.cut_mapping_steps,
         "submaps": tally.acknowledged,
         "revisions_seen": tally.revisions_seen,
         "wall_s": round(tally.wall_s, 3),
@@ -138,6 +140,7 @@ def _observer(progress: str):
             seen.update(figures)
             status.update(
                 f"frame {seen.get('frames', 0)}/{seen.get('of', '?')}, "
+                f"{seen.get('dropped', 0)} dropped, "
                 f"{seen.get('submaps', 0)} sub-maps acknowledged, "
                 f"pose graph revision {seen.get('revision', 0)}"
             )

@@ -2,6 +2,8 @@
 
 magic bench render [--against PROTOTYPE]   forward and backward of the rasteriser
 magic bench track DATASET                  accuracy and speed of tracking, solver by solver
+magic bench map DATASET                    rendering of sub-maps, our schedule against the paper's
+magic bench agent DATASET --threads N      frames per second of one whole agent
 magic bench loops DATASET...               precision and recall of loop detection and verification
 magic bench server                         many agents at once: rate, latencies, memory, event loop
 """
@@ -14,6 +16,8 @@ import sys
 BENCHMARKS = {
     "render": "magic_cli.benchmarks.render",
     "track": "magic_cli.benchmarks.track",
+    "map": "magic_cli.benchmarks.map",
+    "agent": "magic_cli.benchmarks.agent",
     "loops": "magic_cli.benchmarks.loops",
     "server": "magic_cli.benchmarks.server",
 }

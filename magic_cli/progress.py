@@ -72,7 +72,8 @@ class RunProgress:
                 self._tasks[name],
                 completed=figures.get("frames", 0),
                 rate=rate,
-                note=f"{figures.get('submaps', 0)} sub-maps, revision {figures.get('revision', 0)}",
+                note=f"{figures.get('submaps', 0)} sub-maps, revision {figures.get('revision', 0)}"
+                + (f", {figures['dropped']} dropped" if figures.get("dropped") else ""),
             )
         elif time.monotonic() - self._last_line_s > PLAIN_INTERVAL_S:
             self._last_line_s = time.monotonic()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -184,12 +185,64 @@ def test_known_start_places_the_first_anchor_alone():
     assert submaps[1].world_from_anchor_prior is None
 
 
-def test_tracking_goes_on_while_mapping_is_dropped():
+def test_without_time_for_mapping_tracking_goes_on_and_keyframes_are_left_out():
     frames = walk(9)
     slam = LocalSlam(CAMERA, CONFIG, session="s", agent="a", describe=thumbnail)
-    results = [slam.process(frame, mapping=frame.index < 1) for frame in frames]
+    results = [slam.process(frame, mapping_s=0.0 if frame.index else None) for frame in frames]
     assert [r.is_keyframe for r in results] == [True] + [False] * 8
+    assert sum(r.skipped_keyframe for r in results) >= 2  # max_gap is 4
     assert not any(r.lost for r in results)
+
+
+def test_a_hand_over_without_time_still_starts_a_sub_map_that_can_be_tracked_against():
+    frames = walk(24)
+    slam = LocalSlam(CAMERA, CONFIG, session="s", agent="a", describe=thumbnail)
+    results = [slam.process(frame, mapping_s=0.0 if frame.index else None) for frame in frames]
+    assert not any(r.lost for r in results)
+    anchors = [r for r in results if r.finished is not None]
+    assert [r.frame_index for r in anchors] == [10, 20]
+    least, asked = CONFIG.mapping.least_iterations, CONFIG.mapping.anchor_iterations
+    for result in anchors:
+        assert result.mapped is not None
+        assert (result.mapped.iterations, result.mapped.cut_iterations) == (least, asked - least)
+
+
+def test_what_the_sub_map_does_not_explain_becomes_a_keyframe_even_without_time():
+    rule = KeyframeConfig(max_gap=4, urgent_novelty=0.01)
+    config = replace(CONFIG, mapping=replace(CONFIG.mapping, keyframes=rule))
+    slam = LocalSlam(CAMERA, config, session="s", agent="a", describe=thumbnail)
+    results = [slam.process(frame, mapping_s=0.0 if frame.index else None) for frame in walk(9)]
+    assert sum(r.is_keyframe for r in results) >= 2
+    for result in results[1:]:
+        if result.mapped is not None:
+            assert result.mapped.iterations == config.mapping.least_iterations
+
+
+def test_motion_is_predicted_over_frames_that_are_missing():
+    step = se3.exp([0.03, 0.01, 0.02, 0.0, 0.03, 0.0])
+    poses = [look(-0.8, -0.8, 0.0) @ np.linalg.matrix_power(step, i) for i in range(9)]
+    tracking = replace(
+        CONFIG.tracking, initialisation="constant_velocity", rotation_prealignment=False
+    )
+    config = replace(CONFIG, tracking=replace(tracking, window=replace(tracking.window, images=0)))
+    slam = LocalSlam(CAMERA, config, session="s", agent="a", describe=thumbnail)
+    predicted = []
+    slam._tracker._refiner = _Listening(slam._tracker._refiner, predicted)
+    for index in (0, 1, 2, 6):
+        slam.process(Frame(index, index / 30, *render(CAMERA, poses[index])))
+    truth = se3.inverse(poses[0]) @ poses[6]
+    assert np.linalg.norm(se3.log(se3.inverse(truth) @ predicted[-1])[:3]) < 0.02
+
+
+class _Listening:
+    """The tracker's own refiner, which also notes where it was told to start."""
+
+    def __init__(self, refiner, starts: list[np.ndarray]) -> None:
+        self._refiner, self._starts = refiner, starts
+
+    def refine(self, frame, image, *, anchor_from_camera, **options):
+        self._starts.append(anchor_from_camera)
+        return self._refiner.refine(frame, image, anchor_from_camera=anchor_from_camera, **options)
 
 
 def test_nothing_processed_leaves_nothing_to_finish():
