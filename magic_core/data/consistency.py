@@ -23,11 +23,16 @@ _MAX_TURN_RAD = np.deg2rad(30.0)
 _SAMPLE_STRIDE = 6  # pixels
 _MIN_SHARED = 60  # points
 
+_QUARTER = se3.from_rotation_translation(se3.rotation_exp([0.0, 0.0, np.pi / 2]), np.zeros(3))
+
 CONVENTIONS = {
     "world_from_camera, OpenCV axes": lambda pose: pose,
     "camera_from_world, OpenCV axes": se3.inverse,
     "world_from_camera, OpenGL axes": lambda pose: pose @ _OPENGL,
     "camera_from_world, OpenGL axes": lambda pose: se3.inverse(pose) @ _OPENGL,
+    "world_from_camera of images turned a quarter left": lambda pose: pose @ _QUARTER,
+    "world_from_camera of images turned a quarter right": lambda pose: pose @ _QUARTER.T,
+    "world_from_camera of images turned upside down": lambda pose: pose @ _QUARTER @ _QUARTER,
 }
 """Ways in which pose files are written, and how to turn each into ours (the first)."""
 

@@ -27,8 +27,16 @@ class Frame:
     except as the prior of the first pose when the user asks for a known start."""
 
 
+class EndOfFrames(Exception):
+    """A live source has ended, for good: what was seen so far can be finished."""
+
+
 class FrameSource(Protocol):
-    """A sequence of frames of one camera; frames are read lazily, one at a time."""
+    """A sequence of frames of one camera; frames are read lazily, one at a time.
+
+    A live source delivers the next frame whatever index is asked for, and raises EndOfFrames when
+    no more will come; its length is the most frames that it would deliver.
+    """
 
     name: str
     """The agent's name, for example `agent_0`."""

@@ -56,8 +56,9 @@ def open_tum(
 ) -> FileSequence:
     """One recording in the TUM RGB-D layout; distortion is removed from colour and depth."""
     intrinsics = tum_intrinsics(folder)
-    files = subsample(tum_files(folder), stride=stride, max_frames=max_frames)
-    return FileSequence(name, files, intrinsics=intrinsics, scale=scale)
+    files, left_out = tum_files(folder)
+    files = subsample(files, stride=stride, max_frames=max_frames)
+    return FileSequence(name, files, intrinsics=intrinsics, scale=scale, left_out=left_out)
 
 
 def tum_intrinsics(folder: Path) -> Intrinsics:
@@ -75,8 +76,8 @@ def tum_intrinsics(folder: Path) -> Intrinsics:
     )
 
 
-def tum_files(folder: Path) -> list[FrameFiles]:
-    """Frames that have both images, in time order; ground truth where it is near enough."""
+def tum_files(folder: Path) -> tuple[list[FrameFiles], int]:
+    """Frames that have both images, in time order, and how many colour images have no depth."""
     colour_times, colour_names = _read_list(folder / COLOUR_LIST)
     depth_times, depth_names = _read_list(folder / DEPTH_LIST)
     poses = _ground_truth(folder, colour_times)
@@ -94,7 +95,7 @@ def tum_files(folder: Path) -> list[FrameFiles]:
         for i, j in pairs
     ]
     require_increasing_times(files, where=folder / COLOUR_LIST)
-    return files
+    return files, len(colour_times) - len(files)
 
 
 def _read_list(path: Path) -> tuple[NDArray[np.float64], list[str]]:

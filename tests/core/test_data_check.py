@@ -81,7 +81,7 @@ def test_a_wrong_depth_scale_is_suspected_without_poses(recording):
 def test_poses_in_another_convention_are_recognised(recording, convert, named):
     convert_poses(recording, convert)
     failed = findings(recording, "fail")["pose convention"]
-    assert f"the poses are {named}" in failed.remedy
+    assert f"they are {named}" in failed.remedy
 
 
 def test_poses_of_other_frames_do_not_pass(recording):
