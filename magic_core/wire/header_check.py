@@ -31,6 +31,8 @@ class SubmapLimits:
     """Frames in its trajectory."""
     max_keyframes: int = 2_000
     """Keyframes stored with it."""
+    max_pixels: int = 16_000_000
+    """Pixels of one image."""
     max_gaussians: int = 5_000_000
     """Gaussians in it."""
     max_descriptor_dimension: int = 8192
@@ -77,6 +79,9 @@ def _check_limits(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> None
 
 def _violations(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> Iterator[FieldViolation]:
     yield from _identity_violations(header)
+    if (pixels := header.camera.width * header.camera.height) > limits.max_pixels:
+        rule = f"{pixels} pixels per image, at most {limits.max_pixels}; send smaller images"
+        yield FieldViolation("camera.width", rule)
     yield from _trajectory_violations(header)
     yield from _blob_violations(header)
     yield from _keyframe_violations(header)

@@ -17,6 +17,12 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _STANDALONE_MARKERS = frozenset((0x01, *range(0xD0, 0xD8)))
 _PNG_GREY, _PNG_RGB = 0, 2
+MAX_PIXELS = 64_000_000
+"""Larger images are refused by their header, before anything is decoded."""
+MAX_JPEG_SCANS = 100
+"""A progressive JPEG may ask for the whole image to be gone through again with every few bytes."""
+_MAX_PNG_CHUNKS = 100
+_START_OF_SCAN = b"\xff\xda"
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +90,32 @@ def check_image(data: bytes, media_type: str, *, size: tuple[int, int], depth: b
 def _png_header(data: bytes) -> ImageHeader:
     if len(data) < 33 or data[:8] != _PNG_SIGNATURE or data[12:16] != b"IHDR":
         raise CorruptData("not a PNG: the signature or the IHDR chunk is missing")
+    _require_still(data)
     width, height, bits, colour_type = struct.unpack(">IIBB", data[16:26])
     channels = {_PNG_GREY: 1, _PNG_RGB: 3, 3: 1, 4: 2, 6: 4}.get(colour_type, 0)
     return ImageHeader(width, height, bits if colour_type != 3 else 0, channels)
+
+
+def _require_still(data: bytes) -> None:
+    """Refuse an animated PNG, whose frames have sizes of their own, by the chunks before IDAT."""
+    position = 8
+    for _ in range(_MAX_PNG_CHUNKS):
+        kind = data[position + 4 : position + 8]
+        if kind == b"acTL":
+            raise InvalidInput("the PNG is animated; send a still image")
+        if kind in (b"IDAT", b"IEND", b""):
+            return
+        position += 12 + int.from_bytes(data[position : position + 4], "big")
+    raise CorruptData(f"not a PNG that is read here: {_MAX_PNG_CHUNKS} chunks before its pixels")
 
 
 def _jpeg_header(data: bytes) -> ImageHeader:
     """Walk the segments up to the start of frame (ITU-T T.81, annex B)."""
     if data[:2] != b"\xff\xd8":
         raise CorruptData("not a JPEG: the start marker is missing")
+    # Within a scan 0xFF is always escaped, so the marker is never part of the pixels.
+    if (scans := data.count(_START_OF_SCAN)) > MAX_JPEG_SCANS:
+        raise InvalidInput(f"the JPEG has {scans} scans, at most {MAX_JPEG_SCANS} are decoded")
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -111,6 +134,9 @@ def _jpeg_header(data: bytes) -> ImageHeader:
 def _require(
     header: ImageHeader, size: tuple[int, int], *, bits: int, channels: tuple[int, ...], what: str
 ) -> None:
+    if header.width * header.height > MAX_PIXELS:
+        found = f"{header.width}x{header.height}"
+        raise InvalidInput(f"{what} is {found}, at most {MAX_PIXELS} pixels are decoded")
     if (header.width, header.height) != size:
         found = f"{header.width}x{header.height}"
         raise InvalidInput(f"{what} is {found}, the camera says {size[0]}x{size[1]}")
