@@ -20,17 +20,18 @@ import numpy as np
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core import logs, tracing
-from magic_core.errors import DiskFull
+from magic_core.errors import CorruptData, DiskFull
 from magic_core.wire import names, records
 from magic_server.config import ServerConfig
-from magic_server.graph import SessionGraph, initial_board
+from magic_server.graph import SessionGraph
 from magic_server.jobs import JobExecutor
-from magic_server.jobs.tasks import solve_pose_graph, verify_loop
+from magic_server.jobs.tasks import verify_loop
 from magic_server.loops import SubmapKey, select_candidates
 from magic_server.metrics import Metrics
 from magic_server.places import DescriptorIndex
-from magic_server.posegraph import PoseGraphProblem, PoseGraphSolution
+from magic_server.poseboard import PoseBoard
 from magic_server.pruning import without
+from magic_server.solving import Solving
 from magic_server.store import Deleted, NewSolution, SessionRow, Store, StoredSubmap, Vertex
 from magic_server.tasks import TaskScope
 
@@ -59,8 +60,7 @@ class SessionCoordinator:
     ) -> None:
         self.session = session
         self._metrics = metrics
-        self.graph = SessionGraph(session.name)
-        self.board = initial_board(session.name, None)
+        self.graph = SessionGraph(session.name, config.posegraph)
         self._store = store
         self._jobs = jobs
         self._threads = threads
@@ -69,14 +69,21 @@ class SessionCoordinator:
         self._index_lock = asyncio.Lock()
         # Held while the store and what is kept here change together.
         self._editing = asyncio.Lock()
+        self._solving = Solving(
+            session,
+            self.graph,
+            store=store,
+            jobs=jobs,
+            threads=threads,
+            config=config.posegraph,
+            editing=self._editing,
+        )
         # The trace that brought a sub-map; what is made of the sub-map belongs to it.
         self._traces: OrderedDict[str, str] = OrderedDict()
         self._arrived: deque[Vertex] = deque()
         self._pending: deque[records.LoopCandidate] = deque()
         self._verifying = 0
         self._searching = False
-        self._dirty = False
-        self._solving = False
         self._wake = asyncio.Event()
         self._work_done = asyncio.Condition()
         self._tasks = TaskScope(f"session {session.name}")
@@ -96,16 +103,17 @@ class SessionCoordinator:
             self.graph.set_loop(loop)
             if loop.verdict == "PENDING":
                 self._pending.append(loop)
-        self.board = initial_board(
-            self.session.name, await self._store.loops.solution(self.session)
-        )
-        self._dirty = len(self.board.snapshot.poses) != len(vertices) or (
-            self.board.snapshot.loop_count != self.graph.accepted_count
-        )
+        await self._solving.start(on_idle=self._tell_idle)
         for worker in range(self._jobs.workers):
             self._tasks.start(self._verify_for_ever(), name=f"verify {worker}", detached=True)
         self._tasks.start(self._search_for_ever(), name="search", detached=True)
-        self._tasks.start(self._solve_for_ever(), name="solve", detached=True)
+        self._tasks.start(self._solving.take_in_for_ever(), name="take in", detached=True)
+        self._tasks.start(self._solving.solve_for_ever(), name="solve", detached=True)
+
+    @property
+    def board(self) -> PoseBoard:
+        """The newest poses, and those who wait for newer ones."""
+        return self._solving.board
 
     async def close(self) -> None:
         """Stop working; what was begun is done again after the next start."""
@@ -119,7 +127,7 @@ class SessionCoordinator:
             self._traces[vertex.name] = parent
             if len(self._traces) > MAX_TRACES:
                 self._traces.popitem(last=False)
-        self._dirty = True
+        self._solving.wake()
         self._notify()
 
     async def remove(
@@ -146,9 +154,7 @@ class SessionCoordinator:
             self._pending = deque(
                 loop for loop in self._pending if removed.isdisjoint((loop.source, loop.target))
             )
-            if message is not None:
-                self.board.publish(message)
-            self._dirty = True
+            await self._solving.replace(message)
             async with self._index_lock:
                 await self._in_thread(_forget, self._index, removed)
         self._notify()
@@ -177,8 +183,8 @@ class SessionCoordinator:
     @property
     def busy(self) -> bool:
         """Whether a search, a verification or a solve is waiting or under way."""
-        waiting = self._arrived or self._pending or self._dirty
-        return bool(waiting or self._searching or self._verifying or self._solving)
+        waiting = self._arrived or self._pending or self._solving.busy
+        return bool(waiting or self._searching or self._verifying)
 
     @property
     def waiting_searches(self) -> int:
@@ -207,9 +213,7 @@ class SessionCoordinator:
         wanted = self.graph.names_of(agent)
         try:
             async with asyncio.timeout(timeout_s):
-                while not wanted & self.graph.names_of(agent) <= {
-                    pose.submap for pose in self.board.of_agent(agent).poses
-                }:
+                while not self.board.holds(wanted & self.graph.names_of(agent)):
                     await self.board.newer_than(self.board.revision)
         except TimeoutError:
             return False
@@ -297,8 +301,7 @@ class SessionCoordinator:
                     self.graph.set_loop(settled)
                 self._metrics.loops.labels(settled.reason).inc()
                 if settled.verdict == "ACCEPTED":
-                    self._dirty = True
-                    self._notify()
+                    self._solving.wake()
             except DiskFull as error:
                 await self._wait_for_room(error)
                 self._pending.appendleft(loop)
@@ -314,9 +317,11 @@ class SessionCoordinator:
         try:
             source, target = await self._stored(loop.source), await self._stored(loop.target)
             result = await self._jobs.run(verify_loop, source, target, self._config.registration)
-        except Exception:
+        except Exception as error:
             logger.exception("verification of %s -> %s failed", loop.source, loop.target)
-            return dataclasses.replace(loop, verdict="REJECTED", reason="VERIFICATION_FAILED")
+            damaged = isinstance(error, CorruptData)
+            reason = error.reason if damaged else "VERIFICATION_FAILED"
+            return dataclasses.replace(loop, verdict="REJECTED", reason=reason)
         logger.info("%s -> %s: %s", loop.source, loop.target, result.reason)
         return dataclasses.replace(
             loop,
@@ -334,53 +339,6 @@ class SessionCoordinator:
     async def _stored(self, name: str) -> StoredSubmap:
         _, agent, index = names.parse_submap(name)
         return await self._store.submaps.stored(self.session, agent, index)
-
-    # Solving: where everything is
-
-    async def _solve_for_ever(self) -> None:
-        while True:
-            if not self._dirty:
-                await self._sleep()
-                continue
-            self._dirty, self._solving = False, True
-            try:
-                with logs.bound(session=self.session.name), tracing.span("solve pose graph"):
-                    await self._solve()
-            except DiskFull as error:
-                await self._wait_for_room(error)
-                self._dirty = True
-            except Exception:
-                # The last solution stays; the next sub-map or loop tries again.
-                logger.exception("solving the pose graph of %s failed", self.session.name)
-            finally:
-                self._solving = False
-                await self._tell_idle()
-
-    async def _solve(self) -> None:
-        problem = await self._in_thread(self.graph.problem)
-        if not problem.vertices:
-            return
-        solution = await self._jobs.run(solve_pose_graph, problem, self._config.posegraph)
-        async with self._editing:
-            # What was deleted meanwhile must not come back; the graph is solved again anyway.
-            if all(name in self.graph for name in problem.vertices):
-                await self._publish(problem, solution)
-
-    async def _publish(self, problem: PoseGraphProblem, solution: PoseGraphSolution) -> None:
-        revision = self.board.revision + 1
-        message, data, kept = await self._in_thread(self.graph.solved, problem, solution, revision)
-        await self._store.loops.save_solution(
-            self.session, revision=revision, snapshot=data, kept=kept
-        )
-        self.graph.remember(solution)
-        self.board.publish(message)
-        logger.info(
-            "%s: revision %d, %d sub-maps in %d components",
-            self.session.name,
-            revision,
-            len(message.poses),
-            len(message.components),
-        )
 
     @contextlib.contextmanager
     def _about(self, submap: str, doing: str, **attributes: str) -> Iterator[None]:

@@ -2,36 +2,50 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Collection
+from collections import deque
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from magicslam.v1 import geometry_pb2
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core.wire import convert, names, records
 from magic_server.bridging import bridged
-from magic_server.poseboard import PoseBoard
-from magic_server.posegraph import Edge, PoseGraphProblem, PoseGraphSolution
+from magic_server.posegraph import Edge, PoseGraphConfig, stacked
+from magic_server.posegraph.arrays import ArraySolution
+from magic_server.posegraph.online import Change, NewVertex, OnlineGraph
 from magic_server.store import RemovedSubmap, Vertex
 
 
-class SessionGraph:
-    """What the solver needs to know about a session."""
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What a session's pose graph is made of."""
 
-    def __init__(self, session: str) -> None:
+    vertices: tuple[Vertex, ...]
+    loops: tuple[records.LoopCandidate, ...]
+    """The accepted ones."""
+
+
+class SessionGraph:
+    """What the solver needs to know about a session, and the solver's own state."""
+
+    def __init__(self, session: str, config: PoseGraphConfig) -> None:
         self._session = session
+        self._config = config
         self._vertices: dict[str, Vertex] = {}
         self._loops: dict[tuple[str, str], records.LoopCandidate] = {}
-        self._poses: dict[str, np.ndarray] = {}
         self._removed: dict[str, RemovedSubmap] = {}
+        self._new_vertices: deque[Vertex] = deque()
+        self._new_loops: deque[records.LoopCandidate] = deque()
+        self.online = OnlineGraph(config)
+        self.edition = 0
+        """Counts how often the solver's state was begun anew."""
 
     def __contains__(self, submap: str) -> bool:
         return submap in self._vertices
-
-    @property
-    def accepted_count(self) -> int:
-        """Accepted loops."""
-        return sum(loop.verdict == "ACCEPTED" for loop in self._loops.values())
 
     def loops_without(self, gone: Collection[str]) -> int:
         """Accepted loops that touch none of these sub-maps."""
@@ -51,6 +65,7 @@ class SessionGraph:
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
         self._vertices[vertex.name] = vertex
+        self._new_vertices.append(vertex)
 
     def add_removed(self, removed: RemovedSubmap) -> None:
         """A deleted sub-map, over which odometry is carried on."""
@@ -60,7 +75,6 @@ class SessionGraph:
         """Forget sub-maps and their loops; with `keep_odometry`, not how their neighbours lie."""
         for name in submaps:
             vertex = self._vertices.pop(name, None)
-            self._poses.pop(name, None)
             if vertex is not None and keep_odometry:
                 self.add_removed(RemovedSubmap(name, vertex.odometry, vertex.prior))
         gone = set(submaps)
@@ -73,84 +87,133 @@ class SessionGraph:
 
     def set_loop(self, loop: records.LoopCandidate) -> None:
         """A candidate, new or with news."""
+        before = self._loops.get((loop.source, loop.target))
         self._loops[loop.source, loop.target] = loop
+        if loop.verdict == "ACCEPTED" and (before is None or before.verdict != "ACCEPTED"):
+            self._new_loops.append(loop)
 
     def knows_pair(self, source: str, target: str) -> bool:
         """Whether two sub-maps were paired before, in either order."""
         return (source, target) in self._loops or (target, source) in self._loops
 
-    def remember(self, solution: PoseGraphSolution) -> None:
-        """Keep a solution as the start of the next."""
-        self._poses = dict(solution.world_from_anchor)
+    # The solution: what follows belongs to one owner at a time, see solving
 
-    def problem(self) -> PoseGraphProblem:
-        """The graph as it is now."""
-        vertices = list(self._vertices.values())
-        odometry, priors = _bridged_odometry(vertices, dict(self._removed))
-        accepted = [loop for loop in list(self._loops.values()) if loop.verdict == "ACCEPTED"]
-        return PoseGraphProblem(
-            vertices=tuple(vertex.name for vertex in vertices),
-            odometry=odometry,
-            loops=tuple(_loop_edge(loop) for loop in accepted),
-            priors=priors,
-            initial=dict(self._poses) or None,
+    @property
+    def has_news(self) -> bool:
+        """Whether sub-maps or accepted loops wait to be taken in."""
+        return bool(self._new_vertices or self._new_loops)
+
+    def facts(self) -> Facts:
+        """Everything that is known now. Nothing of it is news any more: hand it to `restore`."""
+        self._new_vertices.clear()
+        self._new_loops.clear()
+        accepted = [loop for loop in self._loops.values() if loop.verdict == "ACCEPTED"]
+        return Facts(tuple(self._vertices.values()), tuple(accepted))
+
+    def restore(self, facts: Facts, snapshot: mapping_pb.PoseSnapshot) -> None:
+        """Begin the solver anew, where a solution put things. Slow: not in the event loop.
+
+        What the solution does not hold is told with the next change.
+        """
+        self.online = OnlineGraph(self._config)
+        self.edition += 1
+        stored = convert.snapshot_from_proto(snapshot).poses
+        self.online.restore(
+            [self._joining(vertex) for vertex in facts.vertices],
+            [_loop_edge(loop) for loop in facts.loops],
+            poses={name: (pose.component, pose.world_from_anchor) for name, pose in stored.items()},
+            kept=[number for number, loop in enumerate(facts.loops) if loop.kept],
         )
 
-    def solved(
-        self, problem: PoseGraphProblem, solution: PoseGraphSolution, revision: int
-    ) -> tuple[mapping_pb.PoseSnapshot, bytes, set[tuple[str, str]]]:
-        """A solution as message and bytes, and the (source, target) of the loops it relies on.
+    def advance(self, solution: ArraySolution | None) -> Change:
+        """Adopt a solve of the whole graph, if there is one, and take in what is new."""
+        # Loops first: each came after the sub-maps that it joins.
+        loops = [self._new_loops.popleft() for _ in range(len(self._new_loops))]
+        vertices = [self._new_vertices.popleft() for _ in range(len(self._new_vertices))]
+        joining = [self._joining(vertex) for vertex in vertices]
+        return self.online.advance(joining, [_loop_edge(loop) for loop in loops], solution)
 
-        Slow for thousands of sub-maps: call it off the event loop.
-        """
-        poses = {
-            name: records.CorrectedPose(
-                name, solution.component[name], solution.world_from_anchor[name]
-            )
-            for name in problem.vertices
-        }
-        snapshot = records.PoseSnapshot(
+    def remember(self, change: Change) -> None:
+        """A change is in the store: so are the loops that it took up or dropped."""
+        for numbers, kept in ((change.taken_up, True), (change.dropped, False)):
+            for ends in self.ends_of(numbers):
+                if ends in self._loops:
+                    self._loops[ends] = dataclasses.replace(self._loops[ends], kept=kept)
+
+    def message(self, change: Change, revision: int) -> mapping_pb.PoseSnapshot:
+        """A change as a snapshot that holds the changed poses only."""
+        online = self.online
+        components = online.component[change.vertices].tolist()
+        poses = _pose_messages(
+            [online.names[number] for number in change.vertices.tolist()],
+            [online.names[number] for number in components],
+            online.poses[change.vertices],
+        )
+        return mapping_pb.PoseSnapshot(
             session=names.session_name(self._session),
             revision=revision,
-            solved_at=convert.moment(time.time()),
+            solved_at=convert.timestamp_to_proto(convert.moment(time.time())),
             poses=poses,
-            components=convert.components_of(poses.values()),
-            loop_count=len(problem.loops),
-            loops_kept=sum(solution.kept),
+            components=self._components(),
+            loop_count=online.loop_count,
+            loops_kept=int(online.kept.sum()),
         )
-        message = convert.snapshot_to_proto(snapshot)
-        pairs = zip(problem.loops, solution.kept, strict=True)
+
+    def ends_of(self, loops: Iterable[int]) -> list[tuple[str, str]]:
+        """(source, target) of loops by their number in the solver."""
+        edges = [self.online.loop(int(number)) for number in loops]
         # An edge's source is the loop's target: see _loop_edge.
-        kept = {(edge.target, edge.source) for edge, relied_on in pairs if relied_on}
-        return message, message.SerializeToString(), kept
+        return [(edge.target, edge.source) for edge in edges]
 
+    def kept_loops(self) -> set[tuple[str, str]]:
+        """(source, target) of the loops that the solution relies on."""
+        return set(self.ends_of(np.flatnonzero(self.online.kept)))
 
-def initial_board(session: str, stored: bytes | None) -> PoseBoard:
-    """The board of a session: its stored solution, or revision 0."""
-    if stored is None:
-        return PoseBoard(mapping_pb.PoseSnapshot(session=names.session_name(session)))
-    return PoseBoard(mapping_pb.PoseSnapshot.FromString(stored))
+    def empty_snapshot(self) -> mapping_pb.PoseSnapshot:
+        """Revision 0."""
+        return mapping_pb.PoseSnapshot(session=names.session_name(self._session))
 
+    def _joining(self, vertex: Vertex) -> NewVertex:
+        """A sub-map with its odometry and known start, carried on over deleted ones."""
+        odometry, prior = bridged(vertex, self._removed)
+        if odometry is None:
+            return NewVertex(vertex.name, None, prior, group=vertex.agent)
+        session, agent, _ = names.parse_submap(vertex.name)
+        edge = Edge(
+            source=names.submap_name(session, agent, odometry.previous_index),
+            target=vertex.name,
+            source_from_target=odometry.previous_from_anchor,
+            information=odometry.information,
+        )
+        return NewVertex(vertex.name, edge, prior, group=vertex.agent)
 
-def _bridged_odometry(
-    vertices: list[Vertex], removed: dict[str, RemovedSubmap]
-) -> tuple[tuple[Edge, ...], dict[str, np.ndarray]]:
-    """The odometry edges of sub-maps and their known starts, carried on over deleted ones."""
-    edges, priors = [], {}
-    for vertex in vertices:
-        odometry, prior = bridged(vertex, removed)
-        if prior is not None:
-            priors[vertex.name] = prior
-        if odometry is not None:
-            session, agent, _ = names.parse_submap(vertex.name)
-            edge = Edge(
-                source=names.submap_name(session, agent, odometry.previous_index),
-                target=vertex.name,
-                source_from_target=odometry.previous_from_anchor,
-                information=odometry.information,
+    def _components(self) -> list[mapping_pb.Component]:
+        """Largest first, then by id."""
+        found = [
+            mapping_pb.Component(
+                id=self.online.names[oldest], submap_count=sum(counts.values()), agents=counts
             )
-            edges.append(edge)
-    return tuple(edges), priors
+            for oldest, counts in self.online.members.items()
+        ]
+        return sorted(found, key=lambda c: (-c.submap_count, c.id))
+
+
+def _pose_messages(
+    submaps: Sequence[str], components: Sequence[str], poses: np.ndarray
+) -> list[mapping_pb.CorrectedPose]:
+    """Messages of many poses (n, 4, 4), without a check for each: they come from the solver."""
+    quaternions = stacked.quaternions_from_rotations(poses[:, :3, :3]).tolist()
+    translations = poses[:, :3, 3].tolist()
+    return [
+        mapping_pb.CorrectedPose(
+            submap=submap,
+            component=component,
+            world_from_anchor=geometry_pb2.Pose(x=x, y=y, z=z, qw=w, qx=i, qy=j, qz=k),
+        )
+        for submap, component, (x, y, z), (w, i, j, k) in zip(
+            submaps, components, translations, quaternions, strict=True
+        )
+    ]
 
 
 def _loop_edge(loop: records.LoopCandidate) -> Edge:

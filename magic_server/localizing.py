@@ -22,7 +22,7 @@ from magic_server.store import Store, StoredSubmap, require_model
 
 if TYPE_CHECKING:
     from magic_server.config import ServerConfig
-    from magic_server.registration import RegistrationResult
+    from magic_server.registration.register import RegistrationResult
 
 RETRY_AFTER_S = 2.0
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from magic_server.posegraph import PoseGraphConfig, PoseGraphProblem, solve
+from magic_server.posegraph import PoseGraphConfig, PoseGraphProblem
 from magic_server.posegraph.g2o import problem_of, read_g2o
 from magic_server.posegraph.simulated import agents_in_a_hall, with_wrong_loops
+from magic_server.posegraph.solve import solve
 from magic_server.posegraph.solve_files import solve_files
 
 CONFIG = PoseGraphConfig(odometry_floor_m=0.0, odometry_floor_rad=0.0, odometry_floor_share=0.0)

@@ -23,13 +23,10 @@ from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
     from magic_server.globalmap import MergeConfig
-    from magic_server.posegraph import PoseGraphConfig, PoseGraphProblem, PoseGraphSolution
-    from magic_server.registration import (
-        AnchorView,
-        PreparedView,
-        RegistrationConfig,
-        RegistrationResult,
-    )
+    from magic_server.posegraph import PoseGraphConfig
+    from magic_server.posegraph.arrays import ArraySolution, GraphArrays
+    from magic_server.registration import AnchorView, PreparedView, RegistrationConfig
+    from magic_server.registration.register import RegistrationResult
 
 _PROGRESS_INTERVAL_S = 0.2
 
@@ -80,7 +77,7 @@ def verify_loop(
     source: StoredSubmap, target: StoredSubmap, config: RegistrationConfig
 ) -> RegistrationResult:
     """Register the views of two sub-maps."""
-    from magic_server.registration import register
+    from magic_server.registration.register import register
 
     return register(_prepared(source, config), _prepared(target, config), config)
 
@@ -92,7 +89,8 @@ def localize_image(
 
     The result of each is target_from_camera, None where a sub-map could not be read.
     """
-    from magic_server.registration import prepare, register
+    from magic_server.registration import prepare
+    from magic_server.registration.register import register
 
     view = prepare(_query_view(image), config)
     results: list[RegistrationResult | None] = []
@@ -108,11 +106,11 @@ def localize_image(
     return results
 
 
-def solve_pose_graph(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSolution:
+def solve_pose_graph(graph: GraphArrays, config: PoseGraphConfig) -> ArraySolution:
     """Solve a session's pose graph."""
-    from magic_server.posegraph import solve
+    from magic_server.posegraph.solve import solve_arrays
 
-    return solve(problem, config)
+    return solve_arrays(graph, config)
 
 
 def merge_submaps(task: MergeTask) -> MergeOutcome:

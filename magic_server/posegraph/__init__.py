@@ -1,4 +1,7 @@
-"""The pose graph: sub-maps, tracked and recognised relations, robust optimisation, g2o files."""
+"""The pose graph: sub-maps, tracked and recognised relations, robust optimisation, g2o files.
+
+`magic_server.posegraph.solve.solve` solves it; that module loads the solver, which takes seconds.
+"""
 
 from magic_server.posegraph.problem import (
     Edge,
@@ -6,6 +9,5 @@ from magic_server.posegraph.problem import (
     PoseGraphProblem,
     PoseGraphSolution,
 )
-from magic_server.posegraph.solve import solve
 
-__all__ = ["Edge", "PoseGraphConfig", "PoseGraphProblem", "PoseGraphSolution", "solve"]
+__all__ = ["Edge", "PoseGraphConfig", "PoseGraphProblem", "PoseGraphSolution"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +39,22 @@ class EdgeArrays:
                 [0.5 * (edge.information + edge.information.T) for edge in edges], dtype=np.float64
             ).reshape(-1, 6, 6),
         )
+
+    @classmethod
+    def joined(cls, parts: Sequence[EdgeArrays]) -> EdgeArrays:
+        """The edges of several, one after the other."""
+        if not parts:
+            return cls.of([], {})
+        return cls(
+            np.concatenate([part.source for part in parts]),
+            np.concatenate([part.target for part in parts]),
+            np.concatenate([part.source_from_target for part in parts]),
+            np.concatenate([part.information for part in parts]),
+        )
+
+    def ends(self, edge: int) -> tuple[int, int]:
+        """The numbers of an edge's vertices."""
+        return int(self.source[edge]), int(self.target[edge])
 
     def select(self, index: NDArray) -> EdgeArrays:
         """The edges of a mask or an index array."""
@@ -89,6 +105,29 @@ class EdgeArrays:
         covariance[:, range(6), range(6)] += added
         information = np.linalg.inv(covariance).astype(np.float64)
         return EdgeArrays(self.source, self.target, self.source_from_target, information)
+
+
+@dataclass(frozen=True, slots=True)
+class GraphArrays:
+    """A whole pose graph over vertices numbered from 0, oldest first: cheap to hand to a job."""
+
+    count: int
+    odometry: EdgeArrays
+    """With the tracker's own information; the solver widens it."""
+    loops: EdgeArrays
+    priors: Mapping[int, Array]
+    """Known world_from_anchor (4, 4) of some vertices, all in one world."""
+    initial: Array | None = None
+    """(n, 4, 4) an estimate to start from, NaN where there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySolution:
+    """What comes out, by number."""
+
+    poses: Array  # (n, 4, 4) world_from_anchor, each in the frame of its component
+    component: NDArray[np.int64]  # (n,) the number of its component's oldest vertex
+    kept: NDArray[np.bool_]  # (m,) which loops it rests on
 
 
 def safe_inverse(information: Array) -> Array:

@@ -46,6 +46,14 @@ class PoseGraphConfig:
     max_iterations: int = 100
     """Levenberg-Marquardt iterations of the final solve."""
 
+    @property
+    def squared_norm_limit(self) -> float:
+        """The bound on squared Mahalanobis norms that `inlier_probability` stands for."""
+        from scipy.special import gammaincinv
+
+        # The chi-square quantile with 6 degrees of freedom; scipy.stats loads for seconds.
+        return float(2.0 * gammaincinv(3.0, self.inlier_probability))
+
     def __post_init__(self) -> None:
         if self.robust not in ("none", "gnc"):
             raise ConfigError.field("posegraph.robust", f"{self.robust!r}: expected none or gnc")

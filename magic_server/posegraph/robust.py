@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from magic_server.posegraph.arrays import connected_sets
 from magic_server.posegraph.chains import Chains, shortened
@@ -56,7 +55,7 @@ class RobustSolver:
         self._graph = graph
         self._priors = priors
         self._max_unsupported_m = config.max_unsupported_correction_m
-        self._limit = float(chi2.ppf(config.inlier_probability, 6))
+        self._limit = config.squared_norm_limit
         self._chains = chains
 
     def solve(self, initial: Array | None = None) -> GncResult:

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph import stacked
-from magic_server.posegraph.arrays import EdgeArrays, connected_sets
+from magic_server.posegraph.arrays import (
+    ArraySolution,
+    EdgeArrays,
+    GraphArrays,
+    connected_sets,
+)
 from magic_server.posegraph.chains import Chains, follow
 from magic_server.posegraph.gnc import GncResult, RobustGraph
 from magic_server.posegraph.placement import known_frames, place
@@ -26,11 +31,39 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
     """
     problem.validate()
     number = {name: index for index, name in enumerate(problem.vertices)}
-    count = len(number)
-    odometry = EdgeArrays.of(problem.odometry, number).with_odometry_floor(config)
-    loops = EdgeArrays.of(problem.loops, number)
-    priors = {number[name]: pose for name, pose in problem.priors.items()}
-    initial = _initial(problem, odometry, count)
+    graph = GraphArrays(
+        count=len(number),
+        odometry=EdgeArrays.of(problem.odometry, number),
+        loops=EdgeArrays.of(problem.loops, number),
+        priors={number[name]: pose for name, pose in problem.priors.items()},
+        initial=_known_poses(problem),
+    )
+    solution, start = _solved(graph, config)
+    edges = graph.odometry.with_odometry_floor(config), graph.loops.select(solution.kept)
+    before, after = (
+        0.5 * sum(float(some.squared_norms(at).sum()) for some in edges)
+        for at in (start, solution.poses)
+    )
+    component = solution.component
+    return PoseGraphSolution(
+        world_from_anchor={name: solution.poses[index] for name, index in number.items()},
+        component={name: problem.vertices[component[index]] for name, index in number.items()},
+        kept=tuple(solution.kept.tolist()),
+        error_before=before,
+        error_after=after,
+    )
+
+
+def solve_arrays(graph: GraphArrays, config: PoseGraphConfig) -> ArraySolution:
+    """The same for a graph whose vertices are numbers, which must be sound."""
+    return _solved(graph, config)[0]
+
+
+def _solved(graph: GraphArrays, config: PoseGraphConfig) -> tuple[ArraySolution, Array]:
+    """The solution, and the poses (n, 4, 4) that the search began at."""
+    count, loops, priors = graph.count, graph.loops, graph.priors
+    odometry = graph.odometry.with_odometry_floor(config)
+    initial = None if graph.initial is None else extended(graph.initial, odometry)
     poses = np.tile(np.eye(4), (count, 1, 1))
     start = poses.copy()
     kept = np.zeros(len(loops), dtype=bool)
@@ -39,22 +72,10 @@ def solve(problem: PoseGraphProblem, config: PoseGraphConfig) -> PoseGraphSoluti
         result = solve_part(part, config)
         poses[members], start[members] = result.poses, result.start
         kept[part.loop_index] = result.kept
-    if problem.initial is not None and all(name in problem.initial for name in number):
-        start = np.array([problem.initial[name] for name in number])
-    used = loops.select(kept)
-    component = connected_sets(count, odometry, used, _joined_by_priors(priors))
-    poses = _own_gauge(poses, component, priors)
-    before, after = (
-        0.5 * float(odometry.squared_norms(at).sum() + used.squared_norms(at).sum())
-        for at in (start, poses)
-    )
-    return PoseGraphSolution(
-        world_from_anchor={name: poses[index] for name, index in number.items()},
-        component={name: problem.vertices[component[index]] for name, index in number.items()},
-        kept=tuple(kept.tolist()),
-        error_before=before,
-        error_after=after,
-    )
+    if graph.initial is not None and not np.isnan(graph.initial).any():
+        start = graph.initial
+    component = connected_sets(count, odometry, loops.select(kept), _joined_by_priors(priors))
+    return ArraySolution(_own_gauge(poses, component, priors), component, kept), start
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,17 +133,23 @@ def _part(
     )
 
 
-def _initial(problem: PoseGraphProblem, odometry: EdgeArrays, count: int) -> Array | None:
-    """Poses (n, 4, 4) of the earlier solution; new vertices follow by odometry, NaN if unknown."""
+def _known_poses(problem: PoseGraphProblem) -> Array | None:
+    """(n, 4, 4) of the earlier solution, NaN where it has none."""
     if not problem.initial:
         return None
-    poses = np.full((count, 4, 4), np.nan)
+    poses = np.full((len(problem.vertices), 4, 4), np.nan)
     for index, name in enumerate(problem.vertices):
         if name in problem.initial:
             poses[index] = problem.initial[name]
+    return poses
+
+
+def extended(initial: Array, odometry: EdgeArrays) -> Array:
+    """Poses (n, 4, 4) of an earlier solution; unknown vertices (NaN) follow by odometry."""
+    poses = initial.copy()
     for edge in np.argsort(odometry.target, kind="stable").tolist():
         source, target = int(odometry.source[edge]), int(odometry.target[edge])
-        if np.isnan(poses[target]).any():
+        if np.isnan(poses[target, 0, 0]):
             poses[target] = poses[source] @ odometry.source_from_target[edge]
     return poses
 

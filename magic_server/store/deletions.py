@@ -24,6 +24,7 @@ from magic_server.store.schema import (
     operations,
     removed_submaps,
     sessions,
+    snapshot_changes,
     snapshots,
     submap_blobs,
     submaps,
@@ -254,6 +255,8 @@ async def _replace_solution(
         change = sa.update(snapshots).where(snapshots.c.session_id == session.id)
         values = {"revision": solution.revision, "snapshot": solution.snapshot}
         await connection.execute(change.values(values))
+        old = sa.delete(snapshot_changes)
+        await connection.execute(old.where(snapshot_changes.c.session_id == session.id))
 
 
 async def _drop_submaps(connection: AsyncConnection, which: sa.ColumnElement[bool]) -> None:

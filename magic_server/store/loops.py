@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from magic_core.wire import names, records
 from magic_server.store.database import Database
 from magic_server.store.rows import SessionRow, pack, unpack
-from magic_server.store.schema import agents, loops, snapshots, submaps
+from magic_server.store.schema import agents, loops, snapshot_changes, snapshots, submaps
 
 
 class LoopTable:
@@ -88,7 +88,10 @@ class LoopTable:
         snapshot: bytes,
         kept: Collection[tuple[str, str]],
     ) -> None:
-        """Replace the session's solution; `kept` holds the (source, target) it relies on."""
+        """Replace the session's solution and the changes to it.
+
+        `kept` holds the (source, target) of the loops it relies on.
+        """
         row = {"session_id": session.id, "revision": revision, "snapshot": snapshot}
         mine = loops.c.session_id == session.id
         async with self._database.write() as connection:
@@ -96,6 +99,8 @@ class LoopTable:
                 sa.delete(snapshots).where(snapshots.c.session_id == session.id)
             )
             await connection.execute(sa.insert(snapshots), row)
+            old = sa.delete(snapshot_changes)
+            await connection.execute(old.where(snapshot_changes.c.session_id == session.id))
             rows = await connection.execute(
                 sa.select(loops.c.id, loops.c.source, loops.c.target, loops.c.kept).where(
                     mine, loops.c.verdict == "ACCEPTED"
@@ -107,11 +112,43 @@ class LoopTable:
                     change = sa.update(loops).where(loops.c.id == loop.id).values(kept=wanted)
                     await connection.execute(change)
 
-    async def solution(self, session: SessionRow) -> bytes | None:
-        """The newest solution as a serialised PoseSnapshot, or None before the first."""
-        query = sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == session.id)
+    async def save_change(
+        self,
+        session: SessionRow,
+        *,
+        revision: int,
+        change: bytes,
+        taken_up: Collection[tuple[str, str]],
+        dropped: Collection[tuple[str, str]],
+    ) -> None:
+        """Add a revision on top of the solution: a PoseSnapshot with the changed poses only.
+
+        `taken_up` and `dropped` hold the (source, target) of loops it newly relies on, or no more.
+        """
+        row = {"session_id": session.id, "revision": revision, "change": change}
+        async with self._database.write() as connection:
+            await connection.execute(sa.insert(snapshot_changes), row)
+            for ends, kept in ((taken_up, True), (dropped, False)):
+                for source, target in ends:
+                    mine = sa.update(loops).where(
+                        loops.c.session_id == session.id,
+                        loops.c.source == source,
+                        loops.c.target == target,
+                    )
+                    await connection.execute(mine.values(kept=kept))
+
+    async def solution(self, session: SessionRow) -> tuple[bytes | None, list[bytes]]:
+        """The stored solution, None before the first, and the changes since, oldest first.
+
+        All of them are serialised PoseSnapshots.
+        """
+        whole = sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == session.id)
+        since = sa.select(snapshot_changes.c.change)
+        since = since.where(snapshot_changes.c.session_id == session.id)
         async with self._database.read() as connection:
-            return await connection.scalar(query)
+            stored = await connection.scalar(whole)
+            changes = await connection.scalars(since.order_by(snapshot_changes.c.revision))
+            return stored, list(changes)
 
 
 def _columns(loop: records.LoopCandidate) -> dict[str, object]:

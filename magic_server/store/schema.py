@@ -141,6 +141,15 @@ snapshots = sa.Table(
     sa.Column("snapshot", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
 )
 
+# Revisions since the stored solution, each with the poses that it changed.
+snapshot_changes = sa.Table(
+    "snapshot_changes",
+    metadata,
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
+    sa.Column("revision", sa.Integer, primary_key=True),
+    sa.Column("change", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
+)
+
 operations = sa.Table(
     "operations",
     metadata,

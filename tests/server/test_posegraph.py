@@ -10,7 +10,7 @@ import pytest
 
 from magic_core.errors import ConfigError, InvalidInput
 from magic_core.geometry import se3
-from magic_server.posegraph import Edge, PoseGraphConfig, PoseGraphProblem, solve, stacked
+from magic_server.posegraph import Edge, PoseGraphConfig, PoseGraphProblem, stacked
 from magic_server.posegraph.arrays import EdgeArrays
 from magic_server.posegraph.optimiser import FactorCache, anchored, optimise, values_of
 from magic_server.posegraph.simulated import (
@@ -19,6 +19,7 @@ from magic_server.posegraph.simulated import (
     agents_in_a_hall,
     with_wrong_loops,
 )
+from magic_server.posegraph.solve import solve
 
 TRUSTING = PoseGraphConfig(odometry_floor_m=0, odometry_floor_rad=0, odometry_floor_share=0)
 

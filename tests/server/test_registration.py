@@ -10,10 +10,10 @@ import pytest
 
 from magic_core.errors import ConfigError
 from magic_core.geometry import se3
-from magic_server.registration import AnchorView, RegistrationConfig, prepare, register
+from magic_server.registration import AnchorView, RegistrationConfig, prepare
 from magic_server.registration.benchmark import Anchor, load_anchors, run, true_overlap
 from magic_server.registration.refine import FramePair, Pyramids, refine
-from magic_server.registration.register import loop_information
+from magic_server.registration.register import loop_information, register
 from magic_server.registration.verify import figures_of
 from tests.server.textured_room import CAMERA, TexturedRoom, pose
 

@@ -140,7 +140,7 @@ async def test_what_was_deleted_stays_deleted_in_a_server_started_again(
         assert stored == [name_of(0), name_of(1), name_of(3)]
         # The graph that was rebuilt still knows how 3 lies to 1.
         coordinator = await server.sessions.named("room")
-        (last,) = [e for e in coordinator.graph.problem().odometry if e.target == name_of(3)]
+        last = coordinator.graph.online.odometry_of(name_of(3))
         truth = path(0, SUBMAPS)
         assert last.source == name_of(1)
         np.testing.assert_allclose(

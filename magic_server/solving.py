@@ -1,0 +1,210 @@
+"""Keeps a session's solution up to date: at once where that is certain, exactly a little later.
+
+Two tasks. One takes in what is new (sub-maps, accepted loops, finished solves), stores the change
+and publishes it as a revision; that takes milliseconds, however large the graph. The other solves
+the whole graph in a worker process whenever something is unsettled, and rests between two solves
+for as long as one took, so that it never takes more than half of a worker.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Executor
+
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
+
+from magic_core import logs, tracing
+from magic_core.errors import DiskFull
+from magic_server.graph import SessionGraph
+from magic_server.jobs import JobExecutor
+from magic_server.jobs.tasks import solve_pose_graph
+from magic_server.poseboard import PoseBoard
+from magic_server.posegraph.arrays import ArraySolution
+from magic_server.posegraph.online import Change
+from magic_server.posegraph.problem import PoseGraphConfig
+from magic_server.store import SessionRow, Store
+
+logger = logging.getLogger(__name__)
+
+RETRY_S = 1.0
+MAX_REST_S = 10.0
+JOURNAL_SHARE = 0.5
+"""Changes are stored one by one until together they are this large, relative to the whole."""
+LEAST_JOURNAL_BYTES = 100_000
+
+
+class Solving:
+    """Owns a session's newest solution.
+
+    `editing` is held while the store and what is kept in memory change together.
+    """
+
+    def __init__(
+        self,
+        session: SessionRow,
+        graph: SessionGraph,
+        *,
+        store: Store,
+        jobs: JobExecutor,
+        threads: Executor,
+        config: PoseGraphConfig,
+        editing: asyncio.Lock,
+    ) -> None:
+        self.board = PoseBoard(graph.empty_snapshot())
+        self._session = session
+        self._graph = graph
+        self._store = store
+        self._jobs = jobs
+        self._threads = threads
+        self._config = config
+        self._editing = editing
+        self._finished: tuple[int, ArraySolution] | None = None
+        self._stepping = False
+        self._computing = False
+        self._journal_bytes = 0
+        self._news = asyncio.Event()
+        self._unsettled = asyncio.Event()
+        self._on_idle: Callable[[], Awaitable[None]] = _nothing
+
+    async def start(self, *, on_idle: Callable[[], Awaitable[None]]) -> None:
+        """Take up the stored solution; the graph must hold all sub-maps and loops."""
+        stored, changes = await self._store.loops.solution(self._session)
+        if stored is not None:
+            self.board.publish(mapping_pb.PoseSnapshot.FromString(stored))
+        for change in changes:
+            self.board.apply(mapping_pb.PoseSnapshot.FromString(change))
+        self._journal_bytes = sum(len(change) for change in changes)
+        self._on_idle = on_idle
+        await self._restore()
+        self.wake()
+
+    def wake(self) -> None:
+        """There is something new in the graph."""
+        self._news.set()
+        if self._graph.online.unsettled:
+            self._unsettled.set()
+
+    @property
+    def busy(self) -> bool:
+        """Whether the solution is not yet what it would be if nothing more came."""
+        waiting = self._graph.has_news or self._finished or self._graph.online.unsettled
+        return bool(waiting or self._stepping or self._computing)
+
+    async def replace(self, snapshot: mapping_pb.PoseSnapshot | None) -> None:
+        """Sub-maps were deleted: go on from a solution without them, which the store holds."""
+        if snapshot is not None:
+            self.board.publish(snapshot)
+        self._journal_bytes = 0
+        self._finished = None
+        await self._restore()
+        self.wake()
+
+    async def take_in_for_ever(self) -> None:
+        """Take in what is new, whenever there is something."""
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            self._stepping = True
+            try:
+                async with self._editing:
+                    await self._take_in()
+            except DiskFull as error:
+                logger.warning("%s: %s", self._session.name, error)
+                await self._try_again()
+            except Exception:
+                logger.exception("publishing the poses of %s failed", self._session.name)
+                await self._try_again()
+            finally:
+                self._stepping = False
+            if self._graph.online.unsettled:
+                self._unsettled.set()
+            await self._on_idle()
+
+    async def solve_for_ever(self) -> None:
+        """Solve the whole graph in a worker, whenever that may change something."""
+        while True:
+            await self._unsettled.wait()
+            self._unsettled.clear()
+            started = time.perf_counter()
+            self._computing = True
+            try:
+                async with self._editing:
+                    edition = self._graph.edition
+                    arrays = await self._in_thread(self._graph.online.arrays)
+                with logs.bound(session=self._session.name), tracing.span("solve pose graph"):
+                    solution = await self._jobs.run(solve_pose_graph, arrays, self._config)
+                self._finished = edition, solution
+                self._news.set()
+            except Exception:
+                # The last solution stays; a worker may be back in a moment.
+                logger.exception("solving the pose graph of %s failed", self._session.name)
+                self._graph.online.unsettled = True
+                self._unsettled.set()
+                await asyncio.sleep(RETRY_S)
+            finally:
+                self._computing = False
+            await asyncio.sleep(min(time.perf_counter() - started, MAX_REST_S))
+
+    async def _take_in(self) -> None:
+        finished, self._finished = self._finished, None
+        usable = finished is not None and finished[0] == self._graph.edition
+        solution = finished[1] if finished is not None and usable else None
+        change = await self._in_thread(self._graph.advance, solution)
+        if change or solution is not None:
+            await self._publish(change)
+
+    async def _publish(self, change: Change) -> None:
+        revision = self.board.revision + 1
+        message = await self._in_thread(self._graph.message, change, revision)
+        data = message.SerializeToString()
+        if self._journal_is_long(len(data)):
+            whole = await self._in_thread(self.board.merged, message)
+            data = await self._in_thread(whole.SerializeToString)
+            kept = self._graph.kept_loops()
+            await self._store.loops.save_solution(
+                self._session, revision=revision, snapshot=data, kept=kept
+            )
+            self._journal_bytes = 0
+            self.board.publish(whole)
+        else:
+            await self._store.loops.save_change(
+                self._session,
+                revision=revision,
+                change=data,
+                taken_up=self._graph.ends_of(change.taken_up),
+                dropped=self._graph.ends_of(change.dropped),
+            )
+            self._journal_bytes += len(data)
+            self.board.apply(message)
+        self._graph.remember(change)
+        logger.info(
+            "%s: revision %d: %d sub-maps placed or moved (up to %.4f m), %d loops taken up, "
+            "%d dropped, %d components",
+            self._session.name, revision, len(change.vertices), change.largest_move_m,
+            len(change.taken_up), len(change.dropped), len(message.components),
+        )  # fmt: skip
+
+    async def _try_again(self) -> None:
+        """What was published stays; the graph goes back to it and takes in the rest once more."""
+        await asyncio.sleep(RETRY_S)
+        async with self._editing:
+            await self._restore()
+        self._news.set()
+
+    async def _restore(self) -> None:
+        facts = self._graph.facts()
+        await self._in_thread(self._graph.restore, facts, self.board.snapshot)
+
+    def _journal_is_long(self, added: int) -> bool:
+        limit = max(JOURNAL_SHARE * self.board.bytes, LEAST_JOURNAL_BYTES)
+        return not self.board.revision or self._journal_bytes + added > limit
+
+    async def _in_thread(self, function, *arguments):
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+async def _nothing() -> None:
+    pass
