@@ -16,7 +16,7 @@ from concurrent.futures import Executor
 from magic_agent.client import MagicClient
 from magic_agent.config import UplinkConfig
 from magic_agent.spool import Spool
-from magic_core.errors import DeadlineExceeded, ResourceExhausted, Unavailable
+from magic_core.errors import DeadlineExceeded, MagicError, ResourceExhausted, Unavailable
 from magic_core.evaluation import WireBytes
 from magic_core.submap import Submap
 from magic_core.wire import SubmapEncoding, encode_submap
@@ -100,11 +100,17 @@ class Uplink:
                 receipt = await self._client.submit_encoded(encoded)
                 break
             except (Unavailable, DeadlineExceeded, ResourceExhausted) as error:
-                if waited_s >= self._config.give_up_after_s:
+                if waited_s >= self._config.give_up_after_s or _is_final(error):
                     raise
-                log.warning("sub-map %d waits %.1f s: %s", index, delay_s, error)
-            await asyncio.sleep(delay_s)
-            waited_s += delay_s if self._closed else 0.0
+                pause_s = max(delay_s, error.retry_after_s or 0.0)
+                log.warning("sub-map %d waits %.1f s: %s", index, pause_s, error)
+            await asyncio.sleep(pause_s)
+            waited_s += pause_s if self._closed else 0.0
             delay_s = min(2 * delay_s, self._config.longest_retry_s)
         await loop.run_in_executor(self._executor, self._spool.remove, index)
         self._on_receipt(index, receipt)
+
+
+def _is_final(error: MagicError) -> bool:
+    """Whether waiting is no use: the server names a limit, and no time after which it passes."""
+    return isinstance(error, ResourceExhausted) and error.retry_after_s is None

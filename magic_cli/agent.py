@@ -3,16 +3,16 @@
 Examples:
   magic agent ~/recordings/kitchen --server 192.168.1.20:50051 --session kitchen --name robot_1
   magic agent DATASET --name agent_0 --rate-hz 30      # play it in real time
+  MAGIC_TOKEN=... magic agent DATASET --server map.example:50051 --credentials.ca ca.pem
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +21,11 @@ from tyro.conf import Positional
 from magic_agent.config import AgentConfig
 from magic_cli.options import parse
 from magic_cli.output import console, print_json
+from magic_core import logs, tracing
 from magic_core.errors import DataError
+from magic_core.logs import LogConfig
+from magic_core.tracing import TracingConfig
+from magic_core.wire import ClientCredentials
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +49,12 @@ class AgentCommand(AgentConfig):
     """Use only so many frames."""
     stride: int = 1
     """Use every n-th frame."""
+    credentials: ClientCredentials = field(default_factory=ClientCredentials)
+    """Encryption and token; the token alone can also come from the variable MAGIC_TOKEN."""
+    logs: LogConfig = field(default_factory=LogConfig)
+    """How log lines look."""
+    tracing: TracingConfig = field(default_factory=TracingConfig)
+    """Where traces go."""
     progress: Literal["bar", "json", "none"] = "bar"
     """`json` prints one line per event on stdout, for programs."""
     json: bool = False
@@ -54,8 +64,13 @@ class AgentCommand(AgentConfig):
 def main(arguments: list[str]) -> int:
     """Run one agent; 0 when everything it mapped was acknowledged."""
     command = parse(AgentCommand, arguments, prog="magic agent", description=__doc__ or "")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    report = asyncio.run(run_agent(command))
+    logs.configure(command.logs)
+    logs.bind(session=command.session, agent=command.name)
+    tracing.configure(command.tracing, service=f"magic-agent {command.name}")
+    try:
+        report = asyncio.run(run_agent(command))
+    finally:
+        tracing.shut_down()
     if command.json:
         print_json(report)
     return 0 if report["completed"] else 1
@@ -64,14 +79,14 @@ def main(arguments: list[str]) -> int:
 async def run_agent(command: AgentCommand) -> dict:
     """Run the agent of a command, write its report and trajectory, return the counters."""
     from magic_agent.agent import Agent
-    from magic_agent.client import MagicClient
+    from magic_agent.client import ClientConfig, MagicClient
     from magic_agent.places import load_descriptor_model
     from magic_core.evaluation import RunFolder
 
     source = _source(command)
     folder = RunFolder(command.out)
     model = load_descriptor_model(command.places_model)
-    async with MagicClient(command.server) as client:
+    async with MagicClient(command.server, ClientConfig(credentials=command.credentials)) as client:
         agent = Agent(
             source,
             client,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
-import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
@@ -21,6 +21,7 @@ from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 
+from magic_core import logs, tracing
 from magic_core.errors import Unavailable
 from magic_core.wire import server_options
 from magic_server.access import AccessControl
@@ -33,6 +34,7 @@ from magic_server.interceptors import CallInterceptor
 from magic_server.jobs import ProcessExecutor
 from magic_server.localizing import Localizer
 from magic_server.metrics import Metrics
+from magic_server.native_log import NativeLog
 from magic_server.probes import ProbePort
 from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
@@ -40,6 +42,7 @@ from magic_server.removal import Removal
 from magic_server.resources import Resources
 from magic_server.servicers import GlobalMapServicer, MappingServicer, SessionServicer
 from magic_server.sessions import Sessions
+from magic_server.signals import stop_signals
 from magic_server.store import Store
 from magic_server.tls import server_credentials
 
@@ -122,6 +125,11 @@ class Server:
         host = self.config.listen.host
         return f"{'127.0.0.1' if host in ('0.0.0.0', '::', '[::]') else host}:{self.port}"
 
+    @property
+    def metrics_address(self) -> str | None:
+        """Where /metrics, /livez and /readyz are, None where they are off."""
+        return None if self._probes is None else f"{self.config.metrics.host}:{self._probes.port}"
+
     async def start(self) -> None:
         """Open the store, take up what was left, and serve."""
         try:
@@ -135,7 +143,14 @@ class Server:
         except BaseException:
             await self.stop()
             raise
-        logger.info("serving on %s, data in %s", self.address, self.config.data_dir)
+        logger.info(
+            "serving on %s (%s), data in %s",
+            self.address,
+            "TLS" if self.config.tls.enabled else "plaintext",
+            self.config.data_dir,
+        )
+        if self.access.open and self.config.tls.client_ca is None:
+            logger.warning("no tokens are configured: whoever can connect may do everything")
 
     async def stop(self) -> None:
         """Refuse new calls, let those under way finish, keep everything that was acknowledged."""
@@ -237,21 +252,37 @@ class Server:
 
 
 async def serve(config: ServerConfig, *, on_ready: Callable[[Server], None] | None = None) -> None:
-    """Serve until SIGINT or SIGTERM; `on_ready` is called once the port is open."""
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    try:
-        async with Server(config) as server:
+    """Serve until SIGINT or SIGTERM; `on_ready` is called once the server takes calls.
+
+    The first signal drains the server, a second one ends the process at once. SIGHUP reads the
+    callers again; certificates are read again by themselves.
+    """
+    server = Server(config)
+    with _native_log(config, server), stop_signals(on_reload=server.access.reload) as stop:
+        async with server:
             _keep_the_loop_smooth()
             if on_ready is not None:
                 on_ready(server)
             await stop.wait()
-            logger.info("stopping")
+    await asyncio.to_thread(tracing.shut_down)
+
+
+@contextlib.contextmanager
+def _native_log(config: ServerConfig, server: Server) -> Iterator[None]:
+    """Counts handshakes that fail, and keeps the C core's own lines out of a JSON log."""
+    if not config.tls.enabled and config.logs.format == "text":
+        yield
+        return
+
+    def count(reason: str) -> None:
+        server.metrics.handshake_failures.labels(reason).inc()
+
+    native = NativeLog(on_handshake_failure=count)
+    logs.configure(config.logs, stream=native.stream())
+    try:
+        yield
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)
+        native.close()
 
 
 def _keep_the_loop_smooth() -> None:

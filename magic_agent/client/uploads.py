@@ -12,6 +12,7 @@ import grpc
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_agent.client.connection import Connection
+from magic_core import tracing
 from magic_core.errors import DeadlineExceeded, InvalidInput, MagicError, Unavailable
 from magic_core.submap import Submap
 from magic_core.wire import (
@@ -55,6 +56,10 @@ class UploadCalls(Connection):
         anything gained; each time the stream begins behind the last byte that the server has on
         its disk. `resume`: begin there at once, because an earlier call or process sent a part.
         """
+        with tracing.span("submit sub-map", submap=encoded.header.name, bytes=encoded.wire_bytes):
+            return await self._submitted(encoded, resume=resume)
+
+    async def _submitted(self, encoded: EncodedSubmap, *, resume: bool) -> records.SubmapReceipt:
         name, request_id = encoded.header.name, encoded.header.request_id
         held, failures = 0, 0
         start = _BEGINNING
