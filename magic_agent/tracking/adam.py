@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import AdamConfig, GaussNewtonConfig
+from magic_agent.tracking.exposure import SAME, Exposure
 from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, View
 from magic_agent.tracking.pyramid import Pyramid, view_pyramid
 from magic_agent.tracking.refinement import DifferentiableView, Pose, ReferenceView, Refinement
@@ -46,16 +47,23 @@ class AdamRefiner:
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
         initialised: bool = False,
+        expected: Pose | None = None,
+        exposure: Exposure | None = None,
         clock: StageClock,
     ) -> Refinement:
-        """The pose after all steps, by the sub-map alone; its fit is that of a last render."""
+        """The pose after all steps, by the sub-map alone; its fit is that of a last render.
+
+        A known jump of the exposure is taken out of the image; the paper's loss has no gain.
+        """
         if not isinstance(reference, DifferentiableView):
             raise ConfigError.field(
                 "tracking.solver", "adam needs a reference view with gradients (`backward`)"
             )
         pose = anchor_from_camera
         first, second = np.zeros(6), np.zeros(6)
-        target = np.moveaxis(image.levels[0], -1, 0)
+        exposure = exposure or SAME
+        target = np.moveaxis(image.levels[0], -1, 0).copy()
+        target[:3] = exposure.gain * target[:3] + exposure.bias
         for step in range(1, self._config.iterations + 1):
             with clock.stage("render"):
                 view = reference(pose).image
@@ -71,8 +79,8 @@ class AdamRefiner:
         with clock.stage("render"):
             view = reference(pose).image
         with clock.stage("loss"):
-            alignment = self._judged(view, image, pose)
-        return Refinement(alignment, self._config.iterations + 1)
+            alignment = self._judged(view, image, pose, exposure)
+        return Refinement(alignment, self._config.iterations + 1, exposure)
 
     def loss_gradient(self, view: Float32, target: Float32) -> Float32:
         """dL / d view (5, h, w) of the paper's loss; target is (4, h, w) colour and depth.
@@ -101,9 +109,10 @@ class AdamRefiner:
         inlier = valid & (absolute <= self._config.inlier_factor * median)
         return np.where(inlier, view[4] ** self._config.alpha_power, 0.0).astype(np.float32)
 
-    def _judged(self, view: Float32, image: Pyramid, pose: Pose) -> Alignment:
+    def _judged(self, view: Float32, image: Pyramid, pose: Pose, exposure: Exposure) -> Alignment:
         config = self._quality
         pyramid = view_pyramid(
             view, camera=image.cameras[0], levels=1, alpha_power=config.alpha_power
         )
-        return GaussNewton(config).evaluate([View(pyramid, pose)], image, anchor_from_camera=pose)
+        reference = View(pyramid, pose, exposure=exposure)
+        return GaussNewton(config).evaluate([reference], image, anchor_from_camera=pose)

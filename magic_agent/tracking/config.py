@@ -35,9 +35,9 @@ class GaussNewtonConfig:
     photometric: bool = True
     """Estimate gain and bias of each frame."""
     gain_deviation: float = 0.1
-    """Expected deviation of the gain from 1."""
+    """Expected deviation of the gain from that of the frame before."""
     bias_deviation: float = 0.05
-    """Expected deviation of the bias from 0, in units of full scale."""
+    """Expected deviation of the bias from that of the frame before, in units of full scale."""
     alpha_power: int = 3
     """Soft alpha mask: alpha to this power (paper, supplementary: 3)."""
     inlier_factor: float = 50.0
@@ -52,6 +52,11 @@ class GaussNewtonConfig:
     """Deviation of the motion prior; it decides only where the images do not."""
     prior_rotation_deg: float = 3.0
     """Deviation of the motion prior; it decides only where the images do not."""
+    degenerate_below: float = 10.0
+    """A direction with less information than this, in units of the motion prior's, is degenerate:
+    the pose follows the prior there. 10 is a deviation of 1.6 cm or 0.9 degrees."""
+    probe_pixels: float = 6.0
+    """Weak directions are probed: poses that move the image so far must fit visibly worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +106,7 @@ class LostConfig:
     max_colour_growth: float = 2.5
     """Colour residuals beyond this many times their recent level do not show the same place."""
     max_gain: float = 2.5
-    """Largest step of exposure between frame and sub-map, up or down; more is no likeness."""
+    """Largest factor between the gain expected and the one found; more is no likeness."""
     max_jump_m: float = 0.35
     """Largest translation between consecutive frames."""
     max_turn_deg: float = 25.0

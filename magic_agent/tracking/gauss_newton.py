@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import GaussNewtonConfig
+from magic_agent.tracking.exposure import SAME, Exposure
 from magic_agent.tracking.pyramid import Pyramid
 from magic_core.geometry import Camera, se3
 from magic_core.render.linearisation import (
@@ -43,8 +44,8 @@ class View:
     anchor_from_view: Float64  # (4, 4)
     finest: int = 0
     """The finest level to look at; below, the view's last normal equations stand for it."""
-    gain: float = 1.0
-    bias: float = 0.0
+    exposure: Exposure = SAME
+    """The expected correction of the image to this view's exposure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +70,12 @@ class ViewFit:
     equations: NormalEquations
     model: ResidualModel
     """With the scales that were estimated on that level."""
-    gain: float
-    bias: float
+    exposure: Exposure
+    """Correction of the image to the view's exposure."""
+    level: int
+    """That level."""
     pixels: int
-    """Number of pixels of that level."""
+    """Number of its pixels."""
 
     @property
     def visible_share(self) -> float:
@@ -155,7 +158,7 @@ class GaussNewton:
                 damping *= 30.0
                 for term in terms:
                     term.step_back()
-            if _pixels_moved(step, terms[0].camera) < config.converged_pixels:
+            if pixels_moved(step, terms[0].camera) < config.converged_pixels:
                 break
         return pose
 
@@ -203,7 +206,8 @@ class _Term:
         self._image = image
         self._config = config
         self._view_from_anchor = se3.inverse(view.anchor_from_view)
-        self._photometric = np.array([view.gain, view.bias])
+        self._expected = np.array([view.exposure.gain, view.exposure.bias])
+        self._photometric = self._expected
         self._model = config.residuals
         self._level = -1
         self._frozen: Float64 | None = None
@@ -244,9 +248,9 @@ class _Term:
 
     def fit(self) -> ViewFit:
         """How the image fits this view now."""
-        gain, bias = self._photometric
+        exposure = Exposure(*self._photometric.tolist())
         size = self.camera.width * self.camera.height
-        return ViewFit(self._equations, self._model, float(gain), float(bias), size)
+        return ViewFit(self._equations, self._model, exposure, self._level, size)
 
     def _levels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return self._view.pyramid.levels[self._level], self._image.levels[self._level]
@@ -277,7 +281,7 @@ class _Term:
         weight = config.pixels_per_sample * np.array(
             [config.gain_deviation**-2.0, config.bias_deviation**-2.0]
         )
-        off = self._photometric - (1.0, 0.0)
+        off = self._photometric - self._expected
         coupling = adjoint.T @ equations.hessian[:6, 6:]
         inverse = np.linalg.inv(equations.hessian[6:, 6:] + np.diag(weight))
         slope = equations.gradient[6:] + weight * off
@@ -301,6 +305,6 @@ class _Term:
         )
 
 
-def _pixels_moved(step: Float64, camera: Camera) -> float:
+def pixels_moved(step: Float64, camera: Camera) -> float:
     """Roughly how far a step moves the image, taking a scene at 2 m."""
     return camera.fx * float(np.linalg.norm(step[3:6]) + np.linalg.norm(step[:3]) / 2.0)

@@ -14,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import KeyframeWindowConfig
+from magic_agent.tracking.exposure import SAME, Exposure
 from magic_agent.tracking.gauss_newton import View, ViewFit
 from magic_agent.tracking.pyramid import Pyramid, keyframe_pyramid
 from magic_core.data import Frame
 from magic_core.geometry import se3
 
 Pose = NDArray[np.float64]
+
+_MIN_DEPTH_SHARE = 0.1
+_MIN_CONTRAST = 0.01  # standard deviation of the green channel, full scale is 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,8 @@ class _Kept:
 
     pyramid: Pyramid
     keyframe_from_last: Pose
+    exposure: Exposure = SAME
+    """Correction of the last frame to this image's exposure."""
 
 
 class KeyframeWindow:
@@ -49,13 +55,17 @@ class KeyframeWindow:
         self._kept = [_Kept(self._reference(image), np.eye(4))]
         self._last = frame
 
-    def views(self, anchor_from_last: Pose) -> list[View]:
-        """The images as reference views in the anchor frame of the last frame's pose."""
+    def views(self, anchor_from_last: Pose, *, jump: Exposure = SAME) -> list[View]:
+        """The images as reference views in the anchor frame of the last frame's pose.
+
+        jump: correction of the current image to the last one's exposure.
+        """
         return [
             View(
                 kept.pyramid,
                 anchor_from_last @ se3.inverse(kept.keyframe_from_last),
                 finest=min(self._config.finest_level, len(kept.pyramid) - 1),
+                exposure=kept.exposure.after(jump),
             )
             for kept in self._kept
         ]
@@ -69,15 +79,20 @@ class KeyframeWindow:
             return
         overlaps = [fit.visible_share for fit in fits]
         moved = [
-            replace(kept, keyframe_from_last=kept.keyframe_from_last @ last_from_frame)
-            for kept in self._kept
+            replace(
+                kept,
+                keyframe_from_last=kept.keyframe_from_last @ last_from_frame,
+                exposure=fit.exposure,
+            )
+            for kept, fit in zip(self._kept, fits, strict=True)
         ]
         staying = [
             (overlap, kept)
             for overlap, kept, fit in zip(overlaps, moved, fits, strict=True)
             if overlap >= config.min_overlap and fit.inlier_share >= config.min_inlier_share
         ]
-        if not overlaps or overlaps[-1] < config.new_overlap or not staying:
+        due = not overlaps or overlaps[-1] < config.new_overlap or not staying
+        if due and _shows_something(image):
             while len(staying) >= config.images:
                 staying.remove(min(staying, key=lambda each: each[0]))
             staying.append((1.0, _Kept(self._reference(image), np.eye(4))))
@@ -86,3 +101,10 @@ class KeyframeWindow:
 
     def _reference(self, image: Pyramid) -> Pyramid:
         return keyframe_pyramid(image, finest=min(self._config.finest_level, len(image) - 1))
+
+
+def _shows_something(image: Pyramid) -> bool:
+    """Whether an image has both colour and depth: a covered lens makes no reference."""
+    coarsest = image.levels[-1]
+    has_depth = float((coarsest[..., 3] > 0.0).mean()) > _MIN_DEPTH_SHARE
+    return has_depth and float(coarsest[..., 1].std()) > _MIN_CONTRAST

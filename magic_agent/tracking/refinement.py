@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import GaussNewtonConfig
+from magic_agent.tracking.degeneracy import regularised
+from magic_agent.tracking.exposure import Exposure, matched
 from magic_agent.tracking.gauss_newton import Alignment, GaussNewton, MotionPrior, View
 from magic_agent.tracking.pyramid import Pyramid, view_pyramid
 from magic_agent.tracking.result import StageClock
@@ -19,6 +21,7 @@ from magic_core.geometry import Camera, se3
 from magic_core.render import Rasteriser, RenderedView
 
 Pose = NDArray[np.float64]
+_OPAQUE = 0.7  # mask of a pixel that shows the sub-map and nothing else
 ReferenceView = Callable[[Pose], RenderedView]
 """Renders the sub-map as seen from a pose `anchor_from_camera`."""
 
@@ -59,6 +62,8 @@ class Refinement:
 
     alignment: Alignment
     renders: int
+    exposure: Exposure
+    """The correction to the sub-map's exposure that was expected."""
 
 
 class Refiner(Protocol):
@@ -73,12 +78,16 @@ class Refiner(Protocol):
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
         initialised: bool = False,
+        expected: Pose | None = None,
+        exposure: Exposure | None = None,
         clock: StageClock,
     ) -> Refinement:
         """Refine a first estimate of `anchor_from_camera`.
 
         keyframes: further views to align with. initialised: the estimate comes from images, not
-        from a prediction, and is good to a pixel or two.
+        from a prediction, and is good to a pixel or two. expected: where the motion prior expects
+        the camera; None expects it at the first estimate. exposure: the expected correction of the
+        image to the sub-map's exposure; None compares it with the first render.
         """
         ...
 
@@ -98,11 +107,13 @@ class GaussNewtonRefiner:
         reference: ReferenceView,
         keyframes: Sequence[View] = (),
         initialised: bool = False,
+        expected: Pose | None = None,
+        exposure: Exposure | None = None,
         clock: StageClock,
     ) -> Refinement:
-        """The pose of the minimum near the given one, which is also the motion prior."""
+        """The pose of the minimum near the given one; the prior along degenerate directions."""
         config = self._config
-        prior = MotionPrior.around(anchor_from_camera, config)
+        prior = MotionPrior.around(anchor_from_camera if expected is None else expected, config)
         pose = anchor_from_camera
         for count in range(1, config.renders + 1):
             with clock.stage("render"):
@@ -116,8 +127,11 @@ class GaussNewtonRefiner:
                     levels=coarsest + 1,
                     alpha_power=config.alpha_power,
                 )
+                if exposure is None:
+                    exposure = _exposure_against(pyramid, image)
+                views = [View(pyramid, pose, exposure=exposure), *keyframes]
                 alignment = GaussNewton(config).align(
-                    [View(pyramid, pose), *keyframes],
+                    views,
                     image,
                     anchor_from_camera=pose,
                     prior=prior,
@@ -126,7 +140,9 @@ class GaussNewtonRefiner:
             moved = se3.inverse(pose) @ alignment.anchor_from_camera
             pose = alignment.anchor_from_camera
             if count == config.renders or self._pixels(moved, image) < config.rerender_pixels:
-                return Refinement(alignment, count)
+                with clock.stage("verdict"):
+                    alignment = regularised(alignment, views, image, prior=prior, config=config)
+                return Refinement(alignment, count, exposure)
         raise AssertionError("unreachable: renders is at least 1")
 
     @staticmethod
@@ -134,6 +150,14 @@ class GaussNewtonRefiner:
         """Roughly how far a motion moves the full image, taking a scene at 2 m."""
         shift = float(np.linalg.norm(motion[:3, 3])) / 2.0 + se3.rotation_angle(motion)
         return image.cameras[0].fx * shift
+
+
+def _exposure_against(view: Pyramid, image: Pyramid) -> Exposure:
+    """The image's correction to the exposure of a view of (nearly) the same place."""
+    reference = view.levels[-1]
+    shown = reference[4] > _OPAQUE
+    seen = image.levels[len(view) - 1]
+    return matched(reference[:3].mean(axis=0)[shown], seen[..., :3].mean(axis=-1)[shown])
 
 
 def contrast(frame: Frame) -> float:

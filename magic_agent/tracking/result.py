@@ -35,19 +35,28 @@ class TrackingResult:
     colour_error: float
     """Standard deviation (from the median) of colour residuals, in units of full scale."""
     eigenvalues: NDArray[np.float64]
-    """(6,) of the images' information relative to the motion prior's, ascending."""
+    """(6,) of the images' information relative to the motion prior's, ascending; directions in
+    which nothing but noise spoke are near 0."""
     gain: float
-    """Photometric correction: corrected = gain * frame + bias."""
+    """Photometric correction: gain * frame + bias is as bright as the sub-map."""
     bias: float
+    """In units of full scale."""
     renders: int
     """Renders of the sub-map that were needed."""
     stages_ms: dict[str, float]
-    """Wall time by stage: pyramid, initialisation, render, refinement."""
+    """Wall time by stage: pyramid, rotation, initialisation, render, refinement, verdict; for a
+    lost frame also relocalisation."""
 
     @property
     def lost(self) -> bool:
         """Whether there is no measured pose."""
         return self.verdict == "lost"
+
+    @property
+    def condition_number(self) -> float:
+        """Of the images' information in units of the motion prior: infinite where degenerate."""
+        least, largest = float(self.eigenvalues[0]), float(self.eigenvalues[-1])
+        return largest / least if least > 1e-9 * max(largest, 1e-300) else float("inf")
 
     @property
     def total_ms(self) -> float:

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.tracking.config import TrackingConfig
+from magic_agent.tracking.exposure import SAME, exposure_jump
 from magic_agent.tracking.gauss_newton import MotionPrior
 from magic_agent.tracking.initialisation import InitialPose, make_initialiser
 from magic_agent.tracking.keyframe_window import KeyframeWindow
+from magic_agent.tracking.pyramid import Pyramid
 from magic_agent.tracking.pyramid_cache import PyramidCache
 from magic_agent.tracking.refinement import (
     GaussNewtonRefiner,
@@ -53,6 +55,7 @@ class Tracker:
         self._window = KeyframeWindow(self._config.window)
         self._relocaliser: Relocaliser | None = None
         self._usual_colour_error: float | None = None
+        self._exposure = SAME
 
     @property
     def config(self) -> TrackingConfig:
@@ -63,6 +66,11 @@ class Tracker:
         """Forget the frames seen so far (after a jump of the camera or a lost track)."""
         self._initialiser.reset()
         self._window.clear()
+
+    def begin_chain(self) -> None:
+        """Forget also how earlier sub-maps looked: the next one shares nothing with them."""
+        self.reset()
+        self._usual_colour_error, self._exposure = None, SAME
 
     def track(
         self,
@@ -87,16 +95,23 @@ class Tracker:
         predicted = _constant_velocity(anchor_from_previous, anchor_from_before_previous)
         with clock.stage("pyramid"):
             image = self._pyramids.get(frame)
+            before = self._pyramids.get(previous)
+            self._window.start(previous, before)
+            jump = exposure_jump(before, image)
+            shown = frame if jump == SAME else jump.corrected(frame)
+        with clock.stage("rotation"):
+            predicted = self._turned(before, self._pyramids.get(shown), predicted)
         with clock.stage("initialisation"):
-            start = self._start(frame, previous, predicted)
-            self._window.start(previous, self._pyramids.get(previous))
+            start = self._start(shown, previous, predicted)
         refinement = self._refiner.refine(
             frame,
             image,
             anchor_from_camera=anchor_from_previous @ start.previous_from_current,
             reference=reference,
-            keyframes=self._window.views(anchor_from_previous),
+            keyframes=self._window.views(anchor_from_previous, jump=jump),
             initialised=start.ok and self._config.initialisation != "constant_velocity",
+            expected=anchor_from_previous @ predicted,
+            exposure=self._exposure.after(jump),
             clock=clock,
         )
         result = self._result(
@@ -146,16 +161,17 @@ class Tracker:
             refine=lambda pose: self.refine(frame, anchor_from_camera=pose, reference=reference),
         )
 
+    def _turned(self, previous: Pyramid, current: Pyramid, predicted: Pose) -> Pose:
+        """The prediction, turned where tiny images show a turn that it did not foresee."""
+        if not self._config.rotation_prealignment:
+            return predicted
+        fit = align_rotation(previous, current, previous_from_current=predicted)
+        if fit is None or fit.cost_after >= _TURN_GAIN * fit.cost_before:
+            return predicted
+        return fit.previous_from_current
+
     def _start(self, frame: Frame, previous: Frame, predicted: Pose) -> InitialPose:
         """The motion before refinement."""
-        if self._config.rotation_prealignment:
-            fit = align_rotation(
-                self._pyramids.get(previous),
-                self._pyramids.get(frame),
-                previous_from_current=predicted,
-            )
-            if fit is not None and fit.cost_after < _TURN_GAIN * fit.cost_before:
-                predicted = fit.previous_from_current
         initial = self._initialiser.estimate(
             previous, frame, camera=self._camera, predicted_previous_from_current=predicted
         )
@@ -185,12 +201,14 @@ class Tracker:
             previous_from_camera=se3.inverse(anchor_from_previous) @ alignment.anchor_from_camera,
             prior=prior,
             usual_colour_error=self._usual_colour_error,
+            degenerate_below=self._config.gauss_newton.degenerate_below,
             config=self._config.lost,
         )
         lost = judgement.verdict == "lost"
         fit = alignment.fits[0]
         if not lost and contrast(frame) >= self._config.lost.min_contrast:
             self._note_colour_error(fit.model.colour_sigma)
+            self._exposure = fit.exposure
         return TrackingResult(
             anchor_from_camera=(
                 anchor_from_previous @ predicted if lost else alignment.anchor_from_camera
@@ -203,8 +221,8 @@ class Tracker:
             cost=fit.equations.mean_cost,
             colour_error=fit.model.colour_sigma,
             eigenvalues=judgement.eigenvalues,
-            gain=fit.gain,
-            bias=fit.bias,
+            gain=fit.exposure.gain,
+            bias=fit.exposure.bias,
             renders=refinement.renders,
             stages_ms=clock.stages_ms,
         )

@@ -32,10 +32,11 @@ def judge(
     previous_from_camera: NDArray[np.float64],
     prior: NDArray[np.float64],
     usual_colour_error: float | None,
+    degenerate_below: float,
     config: LostConfig,
 ) -> Judgement:
-    """Lost where the view does not fit, or the motion is impossible; degenerate where some
-    direction is known less well from the images than from the motion prior."""
+    """Lost where the view does not fit, or the motion is impossible; degenerate where the images
+    tell less than `degenerate_below` times as much as the motion prior along some direction."""
     fit = refinement.alignment.fits[0]
     visible_share, inlier_share = fit.visible_share, fit.inlier_share
     eigenvalues = relative_eigenvalues(refinement.alignment.information, prior)
@@ -49,8 +50,10 @@ def judge(
         config=config,
     )
     verdict: Verdict = "lost" if reason else "ok"
-    if not reason and eigenvalues[0] < 1.0:
-        verdict, reason = "degenerate", f"information {eigenvalues[0]:.2g} of the motion prior's"
+    if not reason and eigenvalues[0] < degenerate_below:
+        weak = int((eigenvalues < degenerate_below).sum())
+        verdict = "degenerate"
+        reason = f"the images do not show {weak} of 6 directions of motion"
     return Judgement(verdict, reason, inlier_share, visible_share, eigenvalues)
 
 
@@ -104,6 +107,7 @@ def _why_colours_differ(
         limit *= 3.0  # nothing to compare with yet
     if error > limit:
         return f"colour residuals of {error:.3f}, at most {limit:.3f} expected"
-    if not 1.0 / config.max_gain <= fit.gain <= config.max_gain:
-        return f"colours match only with a gain of {fit.gain:.2f}"
+    surprise = fit.exposure.gain / refinement.exposure.gain
+    if not 1.0 / config.max_gain <= surprise <= config.max_gain:
+        return f"colours match only with {surprise:.2f} times the gain that was expected"
     return ""

@@ -86,7 +86,7 @@ def test_exposure_step_is_taken_up_by_gain_and_bias():
     solution = align(first, darker, poses[0])
     assert pose_error(solution.anchor_from_camera, poses[1])[0] < 4.0
     fit = solution.fits[0]
-    assert fit.gain == pytest.approx(1 / 0.7, rel=0.05)
+    assert fit.exposure.gain == pytest.approx(1 / 0.7, rel=0.05)
     blind = align(first, darker, poses[0], photometric=False)
     assert blind.fits[0].model.colour_sigma > 3.0 * fit.model.colour_sigma
 
