@@ -26,6 +26,7 @@ _ITERATIONS = 8
 _CONVERGED_PIXELS = 0.05
 _MIN_WIDTH = 40  # pixels
 _EXPECTED_PIXELS = 2.0  # a smaller surprise is within reach of the coarse-to-fine alignment
+_MIN_CONTRAST = 0.01  # of full scale; below, all turns fit equally well
 _MODEL = ResidualModel(depth_weight=0.0, gate=1e9, colour_width=5.0)
 
 
@@ -44,11 +45,13 @@ def align_rotation(
     """Turn the given motion so that tiny images of two frames agree best.
 
     Phase correlation, which knows no local minima, tells how the images are shifted. None where
-    that is what the given motion expects; otherwise both rotations are refined and the better one
-    counts.
+    that is what the given motion expects, or an image shows nothing; otherwise both rotations are
+    refined and the better one counts.
     """
     level = _level(current)
     image, camera = current.levels[level], current.cameras[level]
+    if min(previous.levels[level][..., 1].std(), image[..., 1].std()) < _MIN_CONTRAST:
+        return None
     reference = _far_reference(previous.levels[level])
     given = se3.from_rotation_translation(previous_from_current[:3, :3], np.zeros(3))
     shifted = shifting_rotation(reference, image, camera)

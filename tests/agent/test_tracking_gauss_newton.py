@@ -204,6 +204,17 @@ def test_rotation_prealignment_leaves_a_fitting_prediction_alone():
     assert align_rotation(pyramid(first), pyramid(second), previous_from_current=truth) is None
 
 
+@pytest.mark.parametrize("level", [0, 12, 255])
+def test_rotation_prealignment_reads_no_turn_out_of_a_covered_lens(level):
+    first = room_frame(walk(1)[0])
+    rng = np.random.default_rng(level)
+    flat = np.clip(level + rng.integers(-1, 2, first.colour.shape), 0, 255).astype(np.uint8)
+    covered = Frame(1, 1 / 30, flat, first.depth)
+    for pair in [(first, covered), (covered, first)]:
+        previous, current = (pyramid(frame) for frame in pair)
+        assert align_rotation(previous, current, previous_from_current=np.eye(4)) is None
+
+
 def test_pyramid_cameras_keep_the_rays():
     cameras = pyramid_cameras(CAMERA, 3)
     full, half = CAMERA.rays(), cameras[1].rays()
