@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -44,7 +45,7 @@ class AgentConfig(SlamConfig):
 
     def validate(self) -> None:
         """Raise ConfigError naming the first value that an agent cannot run with."""
-        if self.rate_hz < 0:
+        if not 0.0 <= self.rate_hz < math.inf:
             raise ConfigError.field("rate_hz", f"{self.rate_hz}: expected 0 or more frames per s")
         if self.queue_frames < 1:
             raise ConfigError.field("queue_frames", f"{self.queue_frames}: expected at least 1")
