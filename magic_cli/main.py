@@ -17,6 +17,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "serve": ("magic_cli.serve", "start a server that agents on any machine can join"),
     "agent": ("magic_cli.agent", "run one agent against a server"),
+    "sessions": (
+        "magic_cli.sessions",
+        "list, show, delete, export and import what a server stores",
+    ),
     "eval": ("magic_cli.evaluate", "measure a finished run again and rewrite its report"),
     "export": ("magic_cli.export", "write a run's map or trajectories in other formats"),
     "posegraph": (

@@ -75,6 +75,8 @@ RULES: dict[str, Rule] = {
     "/magicslam.v1.SessionService/GetSubmap": Rule("read", ("name",)),
     "/magicslam.v1.SessionService/ListSubmaps": Rule("read", ("parent",)),
     "/magicslam.v1.SessionService/DownloadSubmap": Rule("read", ("name",)),
+    "/magicslam.v1.SessionService/ExportSession": Rule("read", ("name",)),
+    "/magicslam.v1.SessionService/ImportSession": Rule("admin", heavy=True),
     "/magicslam.v1.SessionService/DeleteSession": Rule("admin", ("name",)),
     "/magicslam.v1.SessionService/DeleteAgent": Rule("admin", ("name",)),
     "/magicslam.v1.SessionService/DeleteSubmap": Rule("admin", ("name",)),

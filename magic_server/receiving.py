@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import Executor
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import submap_pb2
@@ -46,6 +46,7 @@ from magic_server.tasks import TaskScope
 logger = logging.getLogger(__name__)
 
 Messages = AsyncIterator[mapping_pb.SubmitSubmapRequest]
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,7 +364,7 @@ class Upload:
         self._gaussian_count += check_blob(self.header, index, blob.path.read_bytes())
 
 
-async def next_message(messages: Messages, idle_s: float) -> mapping_pb.SubmitSubmapRequest | None:
+async def next_message(messages: AsyncIterator[_T], idle_s: float) -> _T | None:
     """The next message of a stream, None at its end; DeadlineExceeded when none comes."""
     try:
         async with asyncio.timeout(idle_s):

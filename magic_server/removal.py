@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 
 from magic_core.errors import NotFound, WrongState
 from magic_core.wire import names
 from magic_server.globalmaps import GlobalMaps
 from magic_server.sessions import Sessions
-from magic_server.store import AgentRow, Deleted, DeletionRequest, Store
+from magic_server.store import AgentRow, Deleted, DeletionRequest, SessionRow, Store
 
 
 class Removal:
@@ -43,11 +44,13 @@ class Removal:
         _require_finished(agent, name, force=force)
         coordinator = await self._sessions.coordinator(agent.session)
         request = DeletionRequest(name, request_id, time.time())
-        return await coordinator.remove(
+        deleted = await coordinator.remove(
             lambda: coordinator.graph.names_of(name),
             lambda solution: self._store.deletions.agent(agent, request, solution),
             agent=name,
         )
+        await asyncio.to_thread(self._store.uploads.forget, f"{name}/")
+        return deleted
 
     async def session(self, name: str, *, request_id: str, force: bool) -> Deleted:
         """Delete a session and all it holds by its resource name."""
@@ -55,17 +58,24 @@ class Removal:
         if first := await self._store.deletions.first_answer(name, request_id):
             return first
         session = await self._store.agents.session(session_id)
-        active = await self._store.agents.active(session)
-        if active and not force:
-            agent = names.agent_name(session_id, active[0])
-            raise WrongState(
-                f"{agent} has not finished and may still submit to {name}; finish it, "
-                "or set `force` to delete all the same"
-            )
+        if not force:
+            await require_finished_agents(self._store, session)
         request = DeletionRequest(name, request_id, time.time())
         async with self._sessions.forgotten(session, NotFound(f"{name} was deleted")):
             await self._maps.forget(session)
-            return await self._store.deletions.session(session, request)
+            deleted = await self._store.deletions.session(session, request)
+        await asyncio.to_thread(self._store.uploads.forget, f"{name}/")
+        return deleted
+
+
+async def require_finished_agents(store: Store, session: SessionRow) -> None:
+    """Raise WrongState while an agent of a session may still submit."""
+    if active := await store.agents.active(session):
+        agent = names.agent_name(session.name, active[0])
+        raise WrongState(
+            f"{agent} has not finished and may still submit to {names.session_name(session.name)}; "
+            "finish it, or set `force` to delete all the same"
+        )
 
 
 def _require_finished(agent: AgentRow, name: str, *, force: bool) -> None:

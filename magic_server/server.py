@@ -242,8 +242,10 @@ class Server:
         map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
         sessions = SessionServicer(
             self._store,
-            Removal(self._store, self.sessions, self._maps),
+            self.sessions,
+            removal=Removal(self._store, self.sessions, self._maps),
             threads=self._threads,
+            limits=self.config.limits,
         )
         session_grpc.add_SessionServiceServicer_to_server(sessions, server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, server)

@@ -7,7 +7,8 @@
             ...
 
 Every call has a deadline. Only calls that are idempotent are tried again, and only when the server
-cannot be reached; an upload that breaks off goes on where it broke. Failures raise the classes of `magic_core.errors` that the server raised.
+cannot be reached; an upload that breaks off goes on where it broke. Failures raise the classes of
+`magic_core.errors` that the server raised.
 """
 
 from magic_agent.client.connection import ClientConfig

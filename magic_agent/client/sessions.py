@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterable
+from collections.abc import AsyncIterable, AsyncIterator
 
+import grpc
 from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import submap_pb2
 
@@ -15,8 +16,10 @@ from magic_core.wire import (
     ChunkCursor,
     EncodedSubmap,
     check_chunk,
+    chunks_of,
     convert,
     decode_submap,
+    error_of,
     names,
     records,
 )
@@ -118,6 +121,51 @@ class SessionCalls(Connection):
             return await _collect(self.session_stub.DownloadSubmap(request, timeout=timeout), name)
 
         return await self.retried(attempt)
+
+    async def export_session(self, session: str) -> AsyncIterator[bytes]:
+        """The archive of a session (docs/wire-format.md), piece by piece.
+
+        Not tried again: a session may change between two attempts.
+        """
+        request = session_pb.ExportSessionRequest(name=names.session_name(session))
+        timeout, offset = self.config.download_timeout_s, 0
+        call = self.session_stub.ExportSession(request, timeout=timeout)
+        try:
+            async for message in call:
+                check_chunk(message.chunk)
+                if message.chunk.offset != offset:
+                    raise CorruptData(f"the archive of {session} has a gap at byte {offset}")
+                offset += len(message.chunk.data)
+                yield message.chunk.data
+        except grpc.RpcError as failure:
+            raise error_of(failure) from failure
+        finally:
+            call.cancel()
+
+    async def import_session(self, pieces: AsyncIterable[bytes]) -> records.SessionInfo:
+        """Store the session of an archive; all of it or nothing.
+
+        Raises AlreadyExists when there is one of its name, CorruptData or InvalidInput for an
+        archive that breaks a rule. Not tried again: the pieces are gone.
+        """
+        call = self.session_stub.ImportSession(
+            _archive(pieces), timeout=self.config.download_timeout_s
+        )
+        try:
+            answer = await call
+        except grpc.RpcError as failure:
+            raise error_of(failure) from failure
+        return convert.session_from_proto(answer.session)
+
+
+async def _archive(pieces: AsyncIterable[bytes]) -> AsyncIterator[session_pb.ImportSessionRequest]:
+    offset = 0
+    async for piece in pieces:
+        for chunk in chunks_of(piece):
+            length = len(chunk.data)
+            chunk.offset = offset
+            yield session_pb.ImportSessionRequest(chunk=chunk)
+            offset += length
 
 
 async def _collect(

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+import zlib
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Executor
+from typing import Any
 
 import grpc.aio
 from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 from magicslam.v1 import submap_pb2
 
-from magic_core.errors import NotFound
-from magic_core.wire import convert, names
+from magic_core.errors import InvalidInput, NotFound
+from magic_core.wire import check_chunk, convert, names
+from magic_server.archive import Archives
+from magic_server.config import ServiceLimits
+from magic_server.receiving import next_message
 from magic_server.removal import Removal
 from magic_server.servicers.downloads import file_chunks
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
+from magic_server.sessions import Sessions
 from magic_server.store import Store
 
 Context = grpc.aio.ServicerContext
@@ -24,19 +30,27 @@ Context = grpc.aio.ServicerContext
 class SessionServicer(session_grpc.SessionServiceServicer):
     """Sessions, their agents and their sub-maps."""
 
-    def __init__(self, store: Store, removal: Removal, *, threads: Executor) -> None:
+    def __init__(
+        self,
+        store: Store,
+        sessions: Sessions,
+        *,
+        removal: Removal,
+        threads: Executor,
+        limits: ServiceLimits,
+    ) -> None:
         self._store = store
+        self._sessions = sessions
         self._removal = removal
         self._threads = threads
+        self._limits = limits
+        self._archives = Archives(store, threads=threads, limits=limits.submap)
 
     async def GetSession(  # noqa: N802
         self, request: session_pb.GetSessionRequest, context: Context
     ) -> session_pb.GetSessionResponse:
-        session = names.parse_session(request.name)
-        found, _ = await self._store.agents.session_page(session=session)
-        if not found:
-            raise NotFound(f"{request.name} does not exist")
-        return session_pb.GetSessionResponse(session=convert.session_to_proto(found[0]))
+        session = await self._session(names.parse_session(request.name))
+        return session_pb.GetSessionResponse(session=session)
 
     async def ListSessions(  # noqa: N802
         self, request: session_pb.ListSessionsRequest, context: Context
@@ -153,3 +167,46 @@ class SessionServicer(session_grpc.SessionServiceServicer):
                 self._store.blobs, blob.sha256.hex(), self._threads, blob_index=position
             ):
                 yield session_pb.DownloadSubmapResponse(chunk=chunk)
+
+    async def ExportSession(  # noqa: N802
+        self, request: session_pb.ExportSessionRequest, context: Context
+    ) -> AsyncIterator[session_pb.ExportSessionResponse]:
+        offset = 0
+        async for data in self._archives.export(names.parse_session(request.name)):
+            if data:
+                crc32 = await self._in_thread(zlib.crc32, data)
+                chunk = submap_pb2.BlobChunk(offset=offset, data=data, crc32=crc32)
+                yield session_pb.ExportSessionResponse(chunk=chunk)
+                offset += len(data)
+
+    async def ImportSession(  # noqa: N802
+        self,
+        request_iterator: AsyncIterator[session_pb.ImportSessionRequest],
+        context: Context,
+    ) -> session_pb.ImportSessionResponse:
+        session = await self._archives.import_(self._pieces(aiter(request_iterator)))
+        await self._sessions.named(session)  # what its loops still wait for begins
+        return session_pb.ImportSessionResponse(session=await self._session(session))
+
+    async def _pieces(
+        self, messages: AsyncIterator[session_pb.ImportSessionRequest]
+    ) -> AsyncIterator[bytes]:
+        """The bytes of an archive, in order, each piece as it was sent."""
+        offset = 0
+        while (message := await next_message(messages, self._limits.upload_idle_s)) is not None:
+            await self._in_thread(check_chunk, message.chunk)
+            if (message.chunk.blob_index, message.chunk.offset) != (0, offset):
+                raise InvalidInput.field(
+                    "chunk.offset", f"{message.chunk.offset}, expected {offset} of blob 0"
+                )
+            offset += len(message.chunk.data)
+            yield message.chunk.data
+
+    async def _session(self, session: str) -> session_pb.Session:
+        found, _ = await self._store.agents.session_page(session=session)
+        if not found:
+            raise NotFound(f"{names.session_name(session)} does not exist")
+        return convert.session_to_proto(found[0])
+
+    async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

@@ -2,6 +2,7 @@
 
 from magic_server.store.agents import Registration, require_model
 from magic_server.store.answers import Asked
+from magic_server.store.archive import ImportedSubmap, archive_of
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
 from magic_server.store.maps import NewMap, OpenOperation
@@ -26,6 +27,7 @@ __all__ = [
     "Deleted",
     "DeletionRequest",
     "FirstAnswer",
+    "ImportedSubmap",
     "MapFile",
     "NewMap",
     "NewSolution",
@@ -40,5 +42,6 @@ __all__ = [
     "UploadFolder",
     "UploadName",
     "Vertex",
+    "archive_of",
     "require_model",
 ]

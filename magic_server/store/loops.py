@@ -32,7 +32,7 @@ class LoopTable:
         async with self._database.write() as connection:
             await connection.execute(searched.values(searched=True))
             if candidates:
-                rows = [_columns(loop) | {"session_id": session.id} for loop in candidates]
+                rows = [loop_columns(loop) | {"session_id": session.id} for loop in candidates]
                 await connection.execute(sa.insert(loops), rows)
 
     async def settle(self, session: SessionRow, loop: records.LoopCandidate) -> None:
@@ -43,7 +43,7 @@ class LoopTable:
                 loops.c.source == loop.source,
                 loops.c.target == loop.target,
             )
-            await connection.execute(change.values(_columns(loop)))
+            await connection.execute(change.values(loop_columns(loop)))
 
     async def all(self, session: SessionRow) -> list[records.LoopCandidate]:
         """Every candidate of a session, oldest first."""
@@ -61,7 +61,7 @@ class LoopTable:
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
         following = rows[limit - 1].id if limit is not None and len(rows) > limit else None
-        return [_record(row) for row in rows[:limit]], following
+        return [loop_record(row) for row in rows[:limit]], following
 
     async def kept(self, session: SessionRow) -> list[tuple[str, str]]:
         """(source, target) of the loops that the newest solution relies on."""
@@ -78,7 +78,7 @@ class LoopTable:
         )
         query = query.order_by(loops.c.similarity.desc(), loops.c.id)
         async with self._database.read() as connection:
-            return [_record(row) for row in await connection.execute(query)]
+            return [loop_record(row) for row in await connection.execute(query)]
 
     async def save_solution(
         self,
@@ -151,7 +151,8 @@ class LoopTable:
             return stored, list(changes)
 
 
-def _columns(loop: records.LoopCandidate) -> dict[str, object]:
+def loop_columns(loop: records.LoopCandidate) -> dict[str, object]:
+    """A candidate as the values of its row, the session left out."""
     return {
         "source": loop.source,
         "target": loop.target,
@@ -169,7 +170,8 @@ def _columns(loop: records.LoopCandidate) -> dict[str, object]:
     }
 
 
-def _record(row: sa.Row) -> records.LoopCandidate:
+def loop_record(row: sa.Row) -> records.LoopCandidate:
+    """The candidate of a row."""
     return records.LoopCandidate(
         source=row.source,
         target=row.target,

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Self
 
 import sqlalchemy as sa
+from magicslam.v1 import archive_pb2
 
 from magic_core.errors import WrongState
 from magic_server.store.agents import AgentTable
+from magic_server.store.archive import ArchiveTable, ImportedSubmap
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.database import Database
 from magic_server.store.deletions import Deletions
@@ -58,6 +60,7 @@ class Store:
         self.loops = LoopTable(self._database)
         self.maps = MapTable(self._database)
         self.usage = UsageTable(self._database)
+        self.archive = ArchiveTable(self._database)
         self.deletions = Deletions(
             self._database, self.blobs, lock=self._commit_lock, threads=threads
         )
@@ -130,6 +133,23 @@ class Store:
             fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
             try:
                 await self.maps.succeed(operation, session, made, now=now)
+            except BaseException:
+                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                raise
+
+    async def add_session(
+        self,
+        archive: archive_pb2.SessionArchive,
+        submaps: Sequence[ImportedSubmap],
+        *,
+        written: Sequence[BlobWriter],
+    ) -> None:
+        """Make a checked archive durable: all of its session, or nothing."""
+        loop = asyncio.get_running_loop()
+        async with self._commit_lock:
+            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            try:
+                await self.archive.insert(archive, submaps)
             except BaseException:
                 await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
                 raise

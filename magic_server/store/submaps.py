@@ -66,7 +66,8 @@ class SubmapTable:
             if await connection.scalar(mine) is None:
                 name = names.agent_name(agent.session.name, agent.name)
                 raise NotFound(f"{name} was deleted while it submitted a sub-map")
-            values = _columns(agent, submap) | {"received_at": now}
+            values = submap_columns(agent.session.id, agent.id, submap)
+            values |= {"received_at": now, "searched": False}
             added = await connection.execute(sa.insert(submaps), values)
             key = added.inserted_primary_key
             assert key is not None  # the table has an integer primary key
@@ -166,12 +167,13 @@ def _is(session: SessionRow, agent: str, index: int) -> sa.ColumnElement[bool]:
     )
 
 
-def _columns(agent: AgentRow, submap: NewSubmap) -> dict[str, object]:
+def submap_columns(session_id: int, agent_id: int, submap: NewSubmap) -> dict[str, object]:
+    """A sub-map as the values of its row; when it came and whether it was searched left out."""
     header, vertex = submap.header, submap.vertex
     edge = vertex.odometry
     return {
-        "session_id": agent.session.id,
-        "agent_id": agent.id,
+        "session_id": session_id,
+        "agent_id": agent_id,
         "number": vertex.index,
         "request_id": header.request_id,
         "header_sha256": submap.header_sha256,
@@ -187,7 +189,6 @@ def _columns(agent: AgentRow, submap: NewSubmap) -> dict[str, object]:
         "previous_from_anchor": None if edge is None else pack(edge.previous_from_anchor),
         "information": None if edge is None else pack(edge.information),
         "prior": pack(vertex.prior),
-        "searched": False,
     }
 
 

@@ -271,6 +271,13 @@ class UploadFolder:
         if kept is not None:
             shutil.rmtree(self.folder / name.key, ignore_errors=True)
 
+    def forget(self, beginning: str) -> None:
+        """Drop what is kept of sub-maps whose resource names begin like this."""
+        with self._lock:
+            mine = [k.name for k in self._kept.values() if k.name.submap.startswith(beginning)]
+        for name in mine:
+            self.drop(name)
+
     def prune(self, *, now: float) -> int:
         """Drop what is too old, and the oldest of what is too much; returns how many."""
         dropped = 0

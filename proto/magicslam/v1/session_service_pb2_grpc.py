@@ -85,6 +85,16 @@ class SessionServiceStub:
                 request_serializer=magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapRequest.SerializeToString,
                 response_deserializer=magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapResponse.FromString,
                 _registered_method=True)
+        self.ExportSession = channel.unary_stream(
+                '/magicslam.v1.SessionService/ExportSession',
+                request_serializer=magicslam_dot_v1_dot_session__service__pb2.ExportSessionRequest.SerializeToString,
+                response_deserializer=magicslam_dot_v1_dot_session__service__pb2.ExportSessionResponse.FromString,
+                _registered_method=True)
+        self.ImportSession = channel.stream_unary(
+                '/magicslam.v1.SessionService/ImportSession',
+                request_serializer=magicslam_dot_v1_dot_session__service__pb2.ImportSessionRequest.SerializeToString,
+                response_deserializer=magicslam_dot_v1_dot_session__service__pb2.ImportSessionResponse.FromString,
+                _registered_method=True)
 
 
 class SessionServiceServicer:
@@ -169,6 +179,21 @@ class SessionServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ExportSession(self, request, context):
+        """Streams a session as one archive (docs/wire-format.md), as it is at one instant.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ImportSession(self, request_iterator, context):
+        """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
+        that an upload must keep is checked again.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_SessionServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -221,6 +246,16 @@ def add_SessionServiceServicer_to_server(servicer, server):
                     servicer.DownloadSubmap,
                     request_deserializer=magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapRequest.FromString,
                     response_serializer=magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapResponse.SerializeToString,
+            ),
+            'ExportSession': grpc.unary_stream_rpc_method_handler(
+                    servicer.ExportSession,
+                    request_deserializer=magicslam_dot_v1_dot_session__service__pb2.ExportSessionRequest.FromString,
+                    response_serializer=magicslam_dot_v1_dot_session__service__pb2.ExportSessionResponse.SerializeToString,
+            ),
+            'ImportSession': grpc.stream_unary_rpc_method_handler(
+                    servicer.ImportSession,
+                    request_deserializer=magicslam_dot_v1_dot_session__service__pb2.ImportSessionRequest.FromString,
+                    response_serializer=magicslam_dot_v1_dot_session__service__pb2.ImportSessionResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -494,6 +529,60 @@ class SessionService:
             '/magicslam.v1.SessionService/DownloadSubmap',
             magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapRequest.SerializeToString,
             magicslam_dot_v1_dot_session__service__pb2.DownloadSubmapResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ExportSession(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/magicslam.v1.SessionService/ExportSession',
+            magicslam_dot_v1_dot_session__service__pb2.ExportSessionRequest.SerializeToString,
+            magicslam_dot_v1_dot_session__service__pb2.ExportSessionResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ImportSession(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_unary(
+            request_iterator,
+            target,
+            '/magicslam.v1.SessionService/ImportSession',
+            magicslam_dot_v1_dot_session__service__pb2.ImportSessionRequest.SerializeToString,
+            magicslam_dot_v1_dot_session__service__pb2.ImportSessionResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -47,6 +47,12 @@ class SessionServiceStub:
     """
     DownloadSubmap: _aio.UnaryStreamMultiCallable[_session_service_pb2.DownloadSubmapRequest, _session_service_pb2.DownloadSubmapResponse]
     """Streams a stored sub-map back, header and blobs, byte for byte as submitted."""
+    ExportSession: _aio.UnaryStreamMultiCallable[_session_service_pb2.ExportSessionRequest, _session_service_pb2.ExportSessionResponse]
+    """Streams a session as one archive (docs/wire-format.md), as it is at one instant."""
+    ImportSession: _aio.StreamUnaryMultiCallable[_session_service_pb2.ImportSessionRequest, _session_service_pb2.ImportSessionResponse]
+    """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
+    that an upload must keep is checked again.
+    """
 
 class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
     """Sessions, their agents and their sub-maps."""
@@ -141,5 +147,23 @@ class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _aio.ServicerContext[_session_service_pb2.DownloadSubmapRequest, _abc.AsyncIterator[_session_service_pb2.DownloadSubmapResponse]],
     ) -> _abc.AsyncIterator[_session_service_pb2.DownloadSubmapResponse]:
         """Streams a stored sub-map back, header and blobs, byte for byte as submitted."""
+
+    @_abc_1.abstractmethod
+    def ExportSession(
+        self,
+        request: _session_service_pb2.ExportSessionRequest,
+        context: _aio.ServicerContext[_session_service_pb2.ExportSessionRequest, _abc.AsyncIterator[_session_service_pb2.ExportSessionResponse]],
+    ) -> _abc.AsyncIterator[_session_service_pb2.ExportSessionResponse]:
+        """Streams a session as one archive (docs/wire-format.md), as it is at one instant."""
+
+    @_abc_1.abstractmethod
+    def ImportSession(
+        self,
+        request_iterator: _abc.AsyncIterator[_session_service_pb2.ImportSessionRequest],
+        context: _aio.ServicerContext[_abc.AsyncIterator[_session_service_pb2.ImportSessionRequest], _abc.Awaitable[_session_service_pb2.ImportSessionResponse]],
+    ) -> _abc.Awaitable[_session_service_pb2.ImportSessionResponse]:
+        """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
+        that an upload must keep is checked again.
+        """
 
 def add_SessionServiceServicer_to_server(servicer: SessionServiceServicer, server: _aio.Server) -> None: ...

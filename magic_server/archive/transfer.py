@@ -1,0 +1,100 @@
+"""Sessions out of a store and into one, as the bytes of an archive."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Executor
+from typing import Any
+
+from magic_core.errors import CorruptData, ResourceExhausted
+from magic_core.wire import SubmapLimits, names
+from magic_core.wire.chunks import sha256
+from magic_server.archive import layout
+from magic_server.archive.checking import check_archive
+from magic_server.archive.layout import Member
+from magic_server.archive.reader import ArchiveReader
+from magic_server.store import Store, archive_of
+
+PIECE_BYTES = 1 << 20
+
+
+class Archives:
+    """Exports and imports whole sessions of a store."""
+
+    def __init__(self, store: Store, *, threads: Executor, limits: SubmapLimits) -> None:
+        self._store = store
+        self._threads = threads
+        self._limits = limits
+
+    async def export(self, session: str) -> AsyncIterator[bytes]:
+        """The archive of a session, by its id, in pieces of at most a megabyte.
+
+        Raises NotFound without it, and when something of it is deleted meanwhile.
+        """
+        rows = await self._store.archive.rows(session)
+        archive, digests = await self._in_thread(archive_of, rows)
+        data = await self._in_thread(archive.SerializeToString)
+        blobs = await self._in_thread(self._members, digests)
+        members = [Member(layout.SESSION, len(data), sha256(data).hex()), *blobs]
+        if len(data) > layout.MAX_SESSION_BYTES:
+            raise ResourceExhausted(f"sessions/{session} is too large for one archive")
+        manifest = layout.manifest_of(
+            members, session=names.session_name(session), submaps=len(rows.submaps)
+        )
+        small = layout.tar_header(layout.MANIFEST, len(manifest)) + manifest
+        small += bytes(layout.padding(len(manifest)))
+        small += layout.tar_header(layout.SESSION, len(data)) + data
+        small += bytes(layout.padding(len(data)))
+        for begin in range(0, len(small), PIECE_BYTES):
+            yield small[begin : begin + PIECE_BYTES]
+        for member in blobs:
+            yield layout.tar_header(member.path, member.length)
+            async for piece in self._pieces(member):
+                yield piece
+            yield bytes(layout.padding(member.length))
+        yield layout.END
+
+    async def import_(self, pieces: AsyncIterator[bytes], *, max_bytes: int | None = None) -> str:
+        """Store the session of an archive; returns its id.
+
+        Raises AlreadyExists when there is one of its name, CorruptData or InvalidInput for an
+        archive that breaks a rule. Nothing is stored then.
+        """
+        reader = ArchiveReader(self._store.blobs, max_bytes=max_bytes)
+        try:
+            async for piece in pieces:
+                await self._in_thread(reader.feed, piece)
+            reader.finish()
+            submaps = await self._in_thread(
+                check_archive, reader.archive, reader.blobs, self._limits
+            )
+            written = list(reader.blobs.values())
+            await asyncio.shield(
+                asyncio.ensure_future(
+                    self._store.add_session(reader.archive, submaps, written=written)
+                )
+            )
+        finally:
+            await asyncio.shield(self._in_thread(reader.discard))
+        return names.parse_session(reader.archive.session.name)
+
+    def _members(self, digests: list[str]) -> list[Member]:
+        return [
+            Member(layout.blob_path(digest), self._store.blobs.total_bytes([digest]), digest)
+            for digest in digests
+        ]
+
+    async def _pieces(self, member: Member) -> AsyncIterator[bytes]:
+        offset = 0
+        while offset < member.length:
+            piece = await self._in_thread(
+                self._store.blobs.read_piece, member.sha256, offset, PIECE_BYTES
+            )
+            if not piece:
+                raise CorruptData(f"blob {member.sha256} is shorter than it was")
+            yield piece
+            offset += len(piece)
+
+    async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
