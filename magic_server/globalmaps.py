@@ -28,6 +28,7 @@ from magic_server.jobs.tasks import (
 )
 from magic_server.sessions import Sessions
 from magic_server.store import BlobWriter, MapFile, NewMap, SessionRow, Store
+from magic_server.store.blobs import translated_disk_errors
 from magic_server.tasks import TaskScope
 
 logger = logging.getLogger(__name__)
@@ -89,7 +90,10 @@ class GlobalMaps:
         session = await self._store.agents.session(name)
         if not 0.0 <= request.drain_timeout_s <= 86400.0:
             raise InvalidInput.field("drain_timeout_s", "expected 0 to 86400 seconds")
-        operation, new = await self._store.maps.begin(session, request, now=time.time())
+        limit = self._config.limits.open_operations
+        operation, new = await self._store.maps.begin(
+            session, request, max_open=limit, now=time.time()
+        )
         if new:
             self._begin(operation, session, request)
         return await self._store.maps.operation(name, str(operation))
@@ -124,7 +128,8 @@ class GlobalMaps:
         self, operation: int, session: SessionRow, request: map_pb.BuildGlobalMapRequest
     ) -> None:
         try:
-            await self._merge(operation, session, request)
+            with translated_disk_errors():
+                await self._merge(operation, session, request)
         except MagicError as error:
             await self._store.maps.fail(operation, error, now=time.time())
         except Exception:

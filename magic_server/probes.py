@@ -16,7 +16,7 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 
 from magic_core.errors import ConfigError, Unavailable
 
-_TEXT = [("Content-Type", "text/plain; charset=utf-8")]
+_TEXT = (("Content-Type", "text/plain; charset=utf-8"),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +70,13 @@ class ProbePort:
             case "/metrics":
                 return self._metrics(environment, start)
             case "/livez":
-                start("200 OK", _TEXT)
+                start("200 OK", list(_TEXT))
                 return [b"alive\n"]
             case "/readyz":
                 ready = self._ready()
-                start("200 OK" if ready else "503 Service Unavailable", _TEXT)
+                start("200 OK" if ready else "503 Service Unavailable", list(_TEXT))
                 return [b"ready\n" if ready else b"not ready\n"]
-        start("404 Not Found", _TEXT)
+        start("404 Not Found", list(_TEXT))
         return [b"/metrics, /livez, /readyz\n"]
 
 

@@ -20,8 +20,6 @@ from magic_server.store import AgentRow, Store
 
 MAX_BUCKETS = 10_000
 """Callers whose rate is remembered; the one unseen for longest is forgotten first."""
-BURST_S = 10.0
-"""A bucket holds so many seconds of its rate: that much may come at once."""
 BACKLOG_RETRY_S = 5.0
 
 
@@ -51,6 +49,8 @@ class QuotaConfig:
     """Sessions on the server."""
     calls_per_s: float | None = None
     """Calls of one caller: its token or certificate, else its address."""
+    burst_s: float = 10.0
+    """So many seconds' worth of a rate may come at once."""
     retry_s: float = 60.0
     """How long callers are asked to wait when a total is used up: somebody may delete."""
 
@@ -88,7 +88,7 @@ class Quotas:
         self._resources = resources
         self._backlog = backlog
         self._max_backlog = max_backlog
-        self._rates = Rates(clock)
+        self._rates = Rates(config.burst_s, clock)
         self._held: dict[str, _Held] = {}
         self._paid: OrderedDict[str, None] = OrderedDict()
 
@@ -208,14 +208,15 @@ class Quotas:
 class Rates:
     """Token buckets by name, a bounded number of them."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, burst_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._burst_s = burst_s
         self._clock = clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, seen at
 
     def spend(self, name: str, amount: float, per_s: float) -> float:
         """Take from a bucket: 0, or the seconds to wait when it is empty and nothing was taken."""
         now = self._clock()
-        capacity = max(1.0, per_s * BURST_S)
+        capacity = max(1.0, per_s * self._burst_s)
         tokens, seen = self._buckets.pop(name, (capacity, now))
         tokens = min(capacity, tokens + (now - seen) * per_s)
         admitted = tokens >= min(amount, capacity)

@@ -77,7 +77,7 @@ def _details(
                     FieldViolation(v.field, v.description) for v in bad.field_violations
                 )
             elif detail.Unpack(retry):
-                retry_after_s = max(0.0, retry.retry_delay.ToNanoseconds() * 1e-9)
+                retry_after_s = max(0.0, retry.retry_delay.ToNanoseconds() / 1e9)
     return reason, violations, retry_after_s
 
 

@@ -8,7 +8,7 @@ import sqlalchemy as sa
 from magicslam.v1 import global_map_service_pb2 as map_pb
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import AlreadyExists, MagicError, NotFound, WrongState
+from magic_core.errors import AlreadyExists, MagicError, NotFound, Overloaded, WrongState
 from magic_core.wire import names, records
 from magic_core.wire.convert import moment
 from magic_server.store.database import Database
@@ -36,6 +36,11 @@ class NewMap:
     files: dict[records.MapFormat, MapFile]
 
 
+MERGE_RETRY_S = 10.0
+"""How long callers are asked to wait for a merge to end."""
+_UNFINISHED = ("PENDING", "RUNNING")
+
+
 class MapTable:
     """Operations and what they made."""
 
@@ -43,11 +48,17 @@ class MapTable:
         self._database = database
 
     async def begin(
-        self, session: SessionRow, request: map_pb.BuildGlobalMapRequest, *, now: float
+        self,
+        session: SessionRow,
+        request: map_pb.BuildGlobalMapRequest,
+        *,
+        max_open: int,
+        now: float,
     ) -> tuple[int, bool]:
         """The operation of a request, and whether it is new: a repeat finds the first one.
 
-        Raises AlreadyExists when the request id was used to ask for another map.
+        Raises AlreadyExists when the request id was used to ask for another map, Overloaded when
+        the session has `max_open` operations that are not done.
         """
         same = sa.select(operations.c.id, operations.c.request).where(
             operations.c.session_id == session.id, operations.c.request_id == request.request_id
@@ -61,6 +72,7 @@ class MapTable:
                         "give each request an id of its own"
                     )
                 return found.id, False
+            await _require_place(connection, session, max_open)
             values = {
                 "session_id": session.id,
                 "request_id": request.request_id,
@@ -128,7 +140,7 @@ class MapTable:
     async def unfinished(self) -> list[OpenOperation]:
         """Every operation that is not done, oldest first."""
         query = sa.select(operations.c.id, operations.c.request, sessions.c.name).join(sessions)
-        query = query.where(operations.c.state.in_(("PENDING", "RUNNING")))
+        query = query.where(operations.c.state.in_(_UNFINISHED))
         query = query.order_by(operations.c.id)
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
@@ -191,6 +203,19 @@ _OPERATIONS = (
     .join(sessions, sessions.c.id == operations.c.session_id)
     .outerjoin(maps, maps.c.id == operations.c.map_id)
 )
+
+
+async def _require_place(connection: AsyncConnection, session: SessionRow, max_open: int) -> None:
+    unfinished = sa.select(sa.func.count()).where(
+        operations.c.session_id == session.id, operations.c.state.in_(_UNFINISHED)
+    )
+    count = await connection.scalar(unfinished) or 0
+    if count >= max_open:
+        raise Overloaded(
+            f"{names.session_name(session.name)} has {count} merges that are not done, this server "
+            f"keeps {max_open}; wait for one",
+            retry_after_s=MERGE_RETRY_S,
+        )
 
 
 async def _require_submaps(
