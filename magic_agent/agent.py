@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from magic_agent.client import MagicClient
 from magic_agent.config import AgentConfig
+from magic_agent.frame_report import FrameReport
 from magic_agent.pace import Pace
 from magic_agent.places import DescriptorModel
 from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.spool import Spool
 from magic_agent.tally import Tally
 from magic_agent.uplink import Uplink
-from magic_core.data import Frame, FrameSource
+from magic_core.data import EndOfFrames, Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
 from magic_core.geometry import se3
 from magic_core.render import warm_up
@@ -67,6 +68,7 @@ class Agent:
         self._model = model
         self._observer = observer
         self._spool = Spool(folder / "spool")
+        self._frame_report = FrameReport(folder)
         self._stopping = asyncio.Event()
         self._frames: asyncio.Queue[Frame | None] = asyncio.Queue(config.queue_frames)
         self._pace = (
@@ -89,6 +91,7 @@ class Agent:
         finally:
             self._slam_thread.shutdown(wait=False, cancel_futures=True)
             self._io_threads.shutdown(wait=False, cancel_futures=True)
+            self._frame_report.close()
             self.tally.wall_s = time.monotonic() - start
         return self.tally
 
@@ -146,7 +149,12 @@ class Agent:
                 if self._frames.full():
                     self.tally.dropped_frames += 1
                     continue
-            frame = await loop.run_in_executor(self._io_threads, self._source.__getitem__, number)
+            read = self._source.__getitem__
+            try:
+                frame = await loop.run_in_executor(self._io_threads, read, number)
+            except EndOfFrames as end:  # a live camera: what it showed so far is finished and sent
+                log.warning("%s: %s", self._name, end)
+                break
             await self._frames.put(frame)
         await self._frames.put(None)
 
@@ -175,6 +183,7 @@ class Agent:
 
     def _count(self, result: FrameResult) -> None:
         self.tally.add_frame(result)
+        self._frame_report.add(result)
         correction = self.corrections.get(result.submap_index)
         if correction is not None:
             self.world_from_camera = correction.world_from_anchor @ result.anchor_from_camera

@@ -23,6 +23,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "eval": ("magic_cli.evaluate", "measure a finished run again and rewrite its report"),
     "export": ("magic_cli.export", "write a run's map or trajectories in other formats"),
+    "tracking": ("magic_cli.tracking", "how tracking went: cost, inliers, lost frames, per frame"),
+    "loops": ("magic_cli.loops", "every loop candidate of a run, and why it was believed or not"),
     "posegraph": (
         "magic_cli.posegraph",
         "`posegraph solve FILE...`: solve pose graphs in g2o files",

@@ -32,11 +32,11 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def table(title: str, columns: list[str], rows: list[list[str]]) -> Table:
-    """A rich table; the first column is left-aligned, the others right."""
+def table(title: str, columns: list[str], rows: list[list[str]], *, words: bool = False) -> Table:
+    """A rich table; the first column is left-aligned, the others right, or left for `words`."""
     result = Table(title=title, title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
-        result.add_column(column, justify="left" if number == 0 else "right")
+        result.add_column(column, justify="left" if number == 0 or words else "right")
     for row in rows:
         result.add_row(*row)
     return result

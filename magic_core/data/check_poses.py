@@ -59,7 +59,8 @@ def _convention(source: FileSequence, layout: str) -> Finding:
                        "record a moving camera, or leave the ground truth out")  # fmt: skip
     (convention, factor), best = min(medians.items(), key=lambda item: item[1])
     ours = medians[(DOCUMENTED, 1.0)]
-    detail = f"carried depth differs by {100 * ours:.1f} % when read as {DOCUMENTED}"
+    misfit = f"differs by {100 * ours:.1f} %" if np.isfinite(ours) else "meets nothing"
+    detail = f"carried depth {misfit} when read as {DOCUMENTED}"
     if ours <= _SENSOR_NOISE or best > 0.5 * ours:
         if ours <= _MISFIT:
             return Finding(name, "ok", detail)

@@ -1,7 +1,7 @@
 """A RealSense camera, live: `realsense:` or `realsense://SERIAL?width=640&height=480&fps=30`.
 
 Depth is aligned to colour by librealsense. `realsense:?file=recording.db3` plays a recording of
-librealsense's through the same path, in real time. Needs the `realsense` extra (pyrealsense2).
+librealsense's through the same path. Needs the `realsense` extra (pyrealsense2).
 """
 
 from __future__ import annotations
@@ -124,7 +124,10 @@ class RealSenseSource:
             config.enable_stream(rs.stream.depth, *size, rs.format.z16, options.fps)
             config.enable_stream(rs.stream.color, *size, rs.format.rgb8, options.fps)
         try:
-            return pipeline, pipeline.start(config)
+            profile = pipeline.start(config)
+            if options.file:  # a recording waits for its reader, a camera does not
+                profile.get_device().as_playback().set_real_time(False)
+            return pipeline, profile
         except RuntimeError as error:
             what = options.file or options.serial or "camera"
             raise DataError(

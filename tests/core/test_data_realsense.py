@@ -12,12 +12,12 @@ from magic_core.data import EndOfFrames, open_dataset
 from magic_core.data.realsense import MOST_FRAMES, parse_address
 from magic_core.errors import DataError, NotSupported
 
-WIDTH, HEIGHT, BASELINE_M = 64, 48, 0.015
+WIDTH, HEIGHT, BASELINE_M, FRAMES = 64, 48, 0.015, 30
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Five frames of a wall at 1 m + 1 mm per frame, colour 15 mm beside depth, as librealsense
+    """Thirty frames of a wall at 1 m + 1 mm per frame, colour 15 mm beside depth, as librealsense
     writes them."""
     rs = pytest.importorskip("pyrealsense2", reason="needs the realsense extra")
     path = tmp_path_factory.mktemp("realsense") / "wall.db3"
@@ -57,9 +57,9 @@ def _record(rs, path, device, sensors, profiles):
         queues.append(rs.frame_queue(50))
         sensor.open(sensor.get_stream_profiles()[0])
         sensor.start(queues[-1])
-    for k in range(5):
+    for k in range(FRAMES):
         depth = np.full((HEIGHT, WIDTH), 2 * (1000 + k), np.uint16)
-        colour = np.full((HEIGHT, WIDTH, 3), (10 * k, 20, 30), np.uint8)
+        colour = np.full((HEIGHT, WIDTH, 3), (5 * k, 20, 30), np.uint8)
         for sensor, profile, pixels, size in (
             (sensors[0], profiles[0], depth, 2),
             (sensors[1], profiles[1], colour, 3),
@@ -69,7 +69,7 @@ def _record(rs, path, device, sensors, profiles):
             frame.timestamp, frame.domain = 5000 + 33.333 * k, rs.timestamp_domain.hardware_clock
             frame.frame_number, frame.profile = k, profile.as_video_stream_profile()
             sensor.on_video_frame(frame)
-        time.sleep(0.05)  # the recorder stamps by arrival
+        time.sleep(0.02)  # the recorder stamps by arrival
     for sensor in recorder.query_sensors():
         sensor.stop()
         sensor.close()
@@ -80,13 +80,13 @@ def test_frames_arrive_in_order_with_depth_aligned_to_colour(recording):
     assert len(source) == MOST_FRAMES
     assert (source.camera.width, source.camera.fx) == (WIDTH, pytest.approx(50.0))
     frames = list(source)
-    assert len(frames) >= 3  # playback in real time may pass over frames, as a camera does
+    assert len(frames) >= FRAMES // 2  # librealsense may pass over some while it starts
     assert [frame.index for frame in frames] == list(range(len(frames)))
     times = [frame.timestamp_s for frame in frames]
     assert (np.diff(times) > 0.03).all()
     for frame in frames:
         k = round((frame.timestamp_s - 5.0) / 0.033333)
-        assert frame.colour[5, 5].tolist() == [10 * k, 20, 30]
+        assert frame.colour[5, 5].tolist() == [5 * k, 20, 30]
         assert frame.depth[24, 32] == pytest.approx(1.0 + 1e-3 * k, abs=1e-6)
         assert frame.world_from_camera is None
 
@@ -105,9 +105,9 @@ def test_a_limit_and_a_stride_are_kept(recording):
 def test_the_same_recording_is_read_as_a_bag_with_its_extrinsics(recording):
     (source,) = open_dataset(recording)
     assert (source.camera.width, source.camera.fx) == (WIDTH, 50.0)
-    assert len(source) == 5
+    assert len(source) == FRAMES
     depth = source[3].depth
-    assert source[3].colour[5, 5].tolist() == [30, 20, 30]
+    assert source[3].colour[5, 5].tolist() == [15, 20, 30]
     assert depth[24, 32] == pytest.approx(1.003)
     (played,) = open_dataset(f"realsense:?file={recording}")
     aligned = played[0].depth  # librealsense's own alignment of the same wall
