@@ -72,7 +72,7 @@ def run(
     *,
     scale: float = 0.5,
     frames: int | None = None,
-    poses: Poses = "truth",
+    poses: Poses = "tracked",
     config: SlamConfig | None = None,
     seeds: Sequence[int] = (0, 1, 2),
     progress: Progress = lambda text: None,

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.mapping.config import KeyframeConfig
+from magic_agent.mapping.coverage import Coverage
 from magic_core.geometry import se3
 
 
@@ -24,10 +25,11 @@ def moved_enough(
 
 
 class Window:
-    """Chooses keyframes for optimisation: the newest often, the others by loss and neglect.
+    """Chooses keyframes for optimisation: the newest often, the others by loss, coverage, neglect.
 
-    A keyframe that fits badly, or was not looked at for long, is likelier. So every part of the
-    sub-map keeps its share however long the sub-map is, and well fitted views cost little.
+    A keyframe that fits badly, shows surface that few steps have looked at, or was not looked at
+    for long, is likelier. So every part of the sub-map keeps its share however long the sub-map is
+    and however often the camera came by, and well fitted views cost little.
     """
 
     def __init__(self, newest_share: float, rng: np.random.Generator) -> None:
@@ -35,21 +37,25 @@ class Window:
         self._rng = rng
         self._losses: list[float] = []
         self._waits: list[float] = []
+        self._coverage = Coverage()
 
     def __len__(self) -> int:
         return len(self._losses)
 
-    def add(self) -> None:
-        """Take in a new keyframe; it is the newest from now on."""
+    def add(self, points: NDArray[np.floating], *, depth_m: float) -> None:
+        """Take in a new keyframe, the newest from now on: its surface (n, 3) in the anchor frame
+        and its median depth."""
         self._losses.append(max(self._losses, default=1.0))
         self._waits.append(1.0)
+        self._coverage.add(points, depth_m=depth_m)
 
     def choose(self) -> int:
         """Index of the keyframe for the next step."""
         newest = len(self._losses) - 1
         if newest == 0 or self._rng.random() < self._newest_share:
             return newest
-        weights = np.array(self._losses) * np.array(self._waits)
+        neglect = [self._coverage.neglect(index) for index in range(len(self._losses))]
+        weights = np.array(self._losses) * np.array(self._waits) * np.array(neglect)
         return int(self._rng.choice(len(weights), p=weights / weights.sum()))
 
     def report(self, index: int, loss: float) -> None:
@@ -57,3 +63,4 @@ class Window:
         self._waits = [wait + 1.0 for wait in self._waits]
         self._losses[index] = max(loss, 1e-6)
         self._waits[index] = 1.0
+        self._coverage.look(index)

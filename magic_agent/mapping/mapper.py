@@ -60,6 +60,8 @@ class MappingReport:
 
 
 _UNBOUNDED = MappingBudget()
+_THIN = 8
+"""Every so many pixels of a keyframe tell which surface it covers."""
 
 
 class Mapper:
@@ -176,9 +178,9 @@ class Mapper:
         self._keyframes.append(
             Keyframe(frame.index, frame.timestamp_s, anchor_from_camera, frame.colour, frame.depth)
         )
-        valid = frame.depth[frame.depth > 0]
-        self._median_depths.append(float(np.median(valid)) if len(valid) else 1.0)
-        self._window.add()
+        self._median_depths.append(_median_depth(frame))
+        surface = self._surface(frame, anchor_from_camera)
+        self._window.add(surface, depth_m=self._median_depths[-1])
         began = self._clock()
         iterations, cut, loss = self._optimise(budget, started)
         ended = self._clock()
@@ -210,6 +212,11 @@ class Mapper:
         if len(seeds):
             optimiser.extend(in_morton_order(seeds.transformed(anchor_from_camera)))
         return len(seeds)
+
+    def _surface(self, frame: Frame, anchor_from_camera: Pose) -> NDArray[np.float64]:
+        """(n, 3) points of the frame's surface, a thinned image of them, in the anchor frame."""
+        points = self._camera.back_project(frame.depth)[::_THIN, ::_THIN].reshape(-1, 3)
+        return se3.transform_points(anchor_from_camera, points[points[:, 2] > 0])
 
     def _means_seen(
         self, view: RenderedView | None, anchor_from_camera: Pose
@@ -273,6 +280,11 @@ class Mapper:
         if self._optimiser is None:
             raise WrongState("the mapper has no sub-map yet: call begin() with the first frame")
         return self._optimiser
+
+
+def _median_depth(frame: Frame) -> float:
+    valid = frame.depth[frame.depth > 0]
+    return float(np.median(valid)) if len(valid) else 1.0
 
 
 def _settled(losses: list[float], share: float, span: int = 4) -> bool:

@@ -39,9 +39,15 @@ def choices(window: Window, losses: list[float], steps: int) -> np.ndarray:
 
 def window_of(count: int, newest_share: float, seed: int = 0) -> Window:
     window = Window(newest_share, np.random.default_rng(seed))
-    for _ in range(count):
-        window.add()
+    for number in range(count):
+        window.add(place(number), depth_m=2.0)
     return window
+
+
+def place(number: int) -> np.ndarray:
+    """A wall of 1 m, 10 m apart from the others."""
+    y, z = np.meshgrid(np.linspace(0, 1, 12), np.linspace(0, 1, 12))
+    return np.stack([np.full(y.size, 10.0 * number), y.ravel(), z.ravel()], axis=-1)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -57,6 +63,24 @@ def test_badly_fitted_keyframes_are_looked_at_more_often(seed):
     losses[3] = 0.5
     shares = choices(window_of(10, 0.2, seed), losses, 2000)
     assert shares[3] > 2.0 * np.median(shares[:-1])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_place_that_one_keyframe_shows_gets_as_many_looks_as_one_that_many_show(seed):
+    window = Window(0.0, np.random.default_rng(seed))
+    for number in (0, 1, 1, 1, 1, 1, 1, 1, 1):
+        window.add(place(number), depth_m=2.0)
+    shares = choices(window, [0.1] * 9, 2000)
+    assert 0.2 < shares[0] < 0.5  # a ninth if keyframes were counted, not places
+    assert shares[1:].min() > 0.04
+
+
+def test_a_keyframe_without_depth_is_looked_at_too():
+    window = Window(0.0, np.random.default_rng(0))
+    window.add(place(0), depth_m=2.0)
+    window.add(np.zeros((0, 3)), depth_m=1.0)
+    window.add(place(1), depth_m=2.0)
+    assert choices(window, [0.1] * 3, 500)[1] > 0.1
 
 
 def test_a_single_keyframe_is_always_chosen():
