@@ -25,12 +25,15 @@ from magic_agent.frame_report import FrameReport
 from magic_agent.pace import Pace
 from magic_agent.places import DescriptorModel
 from magic_agent.slam import FrameResult, LocalSlam
+from magic_agent.restart import Restart, find_restart
+from magic_agent.resume import ResumePoint, ResumeState
 from magic_agent.spool import Spool
 from magic_agent.tally import Tally
-from magic_agent.uplink import Uplink
+from magic_agent.uplink import Finished, Uplink
 from magic_core.data import EndOfFrames, Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
 from magic_core.geometry import se3
+from magic_core.evaluation import WireBytes
 from magic_core.render import warm_up
 from magic_core.submap import Submap
 from magic_core.wire import names
@@ -57,7 +60,9 @@ class Agent:
         folder: Path,
         observer: Observer = lambda event, figures: None,
     ) -> None:
+        checkpoint: Callable[[Tally], None] = lambda tally: None,
         self.tally = Tally(name)
+        """`checkpoint` is called on a thread with the figures so far whenever a sub-map is done."""
         self.corrections: dict[int, CorrectedPose] = {}
         """Newest correction per sub-map index."""
         self._source = source
@@ -68,6 +73,9 @@ class Agent:
         self._model = model
         self._observer = observer
         self._spool = Spool(folder / "spool")
+        self._checkpoint = checkpoint
+        self._earlier_sizes: tuple[WireBytes, ...] = ()
+        self._earlier_wall_s = 0.0
         self._frame_report = FrameReport(folder)
         self._stopping = asyncio.Event()
         self._frames: asyncio.Queue[Frame | None] = asyncio.Queue(config.queue_frames)
@@ -85,14 +93,14 @@ class Agent:
 
     async def run(self) -> Tally:
         """Run to the end. Raises the server's refusals; a lost connection is waited out."""
-        start = time.monotonic()
+        self._started = time.monotonic()
         try:
             await self._run()
         finally:
             self._slam_thread.shutdown(wait=False, cancel_futures=True)
             self._io_threads.shutdown(wait=False, cancel_futures=True)
             self._frame_report.close()
-            self.tally.wall_s = time.monotonic() - start
+            self.tally.wall_s = self._wall_s()
         return self.tally
 
     async def _run(self) -> None:
@@ -102,14 +110,17 @@ class Agent:
             model_id=self._model.model_id,
             dimension=self._model.dimension,
         )
-        slam = LocalSlam(
-            self._source.camera,
-            self._config,
+        restart = await find_restart(
+            self._spool,
+            self._client,
+            registration,
             session=self._session,
             agent=self._name,
-            describe=self._model.describe,
-            first_submap_index=max([registration.next_submap_index, *self._spooled_indices()]),
-            world_from_anchor_prior=self._prior(),
+            executor=self._io_threads,
+        )
+        self._take_up(restart)
+        slam = await asyncio.get_running_loop().run_in_executor(
+            self._slam_thread, self._engine, restart.point
         )
         uplink = Uplink(
             self._client,
@@ -120,7 +131,7 @@ class Agent:
             on_receipt=self._on_receipt,
         )
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._read_frames())
+            group.create_task(self._read_frames(restart.next_frame))
             watching = group.create_task(self._watch_corrections())
             sending = group.create_task(uplink.run())
             await self._process_frames(slam, uplink)
@@ -129,19 +140,38 @@ class Agent:
             await self._finish()
             watching.cancel()
 
-    def _prior(self) -> NDArray[np.float64] | None:
-        """The known start, only when the user asked for it (the paper's setting)."""
-        return self._source[0].world_from_camera if self._config.known_start else None
+    def _engine(self, point: ResumePoint) -> LocalSlam:
+        """The local engine, where an earlier process left it."""
+        # A known start places the first anchor of all.
+        known = self._config.known_start and point.next_index == 0
+        return LocalSlam(
+            self._source.camera,
+            self._config,
+            session=self._session,
+            agent=self._name,
+            describe=self._model.describe,
+            world_from_anchor_prior=self._source[0].world_from_camera if known else None,
+            resume=point,
+        )
 
-    def _spooled_indices(self) -> list[int]:
-        """The indices after those that an earlier run of this agent left in the spool."""
-        return [index + 1 for index in self._spool.pending()]
+    def _take_up(self, restart: Restart) -> None:
+        """Count on from where an earlier process was."""
+        if restart.state is None:
+            return
+        self.tally = Tally.from_json(restart.state.tally)
+        self.tally.wire_bytes = list(restart.state.wire_bytes)
+        self.tally.acknowledged = restart.point.next_index - len(self._spool.pending())
+        self._earlier_sizes = restart.state.wire_bytes
+        self._earlier_wall_s = self.tally.wall_s
 
-    async def _read_frames(self) -> None:
+    def _wall_s(self) -> float:
+        return self._earlier_wall_s + time.monotonic() - self._started
+
+    async def _read_frames(self, begin: int) -> None:
         loop = asyncio.get_running_loop()
         if self._pace is not None:  # a live camera does not wait for kernels to be loaded
             await loop.run_in_executor(self._slam_thread, warm_up)
-        for number in range(len(self._source)):
+        for number in range(begin, len(self._source)):
             if self._stopping.is_set():
                 break
             if self._pace is not None:
@@ -159,13 +189,14 @@ class Agent:
         await self._frames.put(None)
 
     async def _process_frames(self, slam: LocalSlam, uplink: Uplink) -> None:
-        loop = asyncio.get_running_loop()
+        loop, next_frame = asyncio.get_running_loop(), 0
         while (frame := await self._frames.get()) is not None:
             result = await loop.run_in_executor(self._slam_thread, self._process, slam, frame)
             self._count(result)
-            await self._hand_over(result.finished, uplink)
+            next_frame = frame.index + 1
+            await self._hand_over(result.finished, result.opening, uplink, next_frame=next_frame)
         last = await loop.run_in_executor(self._slam_thread, slam.finish)
-        await self._hand_over(last, uplink)
+        await self._hand_over(last, None, uplink, next_frame=next_frame)
 
     def _process(self, slam: LocalSlam, frame: Frame) -> FrameResult:
         """Take in one frame; from a live camera, with no more mapping than there is time for."""
@@ -176,10 +207,25 @@ class Agent:
         self._pace.note_tracking(1e-3 * result.tracking_ms)
         return result
 
-    async def _hand_over(self, submap: Submap | None, uplink: Uplink) -> None:
-        if submap is not None:
-            self.tally.add_submap(submap)
-            await uplink.put(submap)
+    async def _hand_over(
+        self, submap: Submap | None, opening: Opening | None, uplink: Uplink, *, next_frame: int
+    ) -> None:
+        if submap is None:
+            return
+        self.tally.add_submap(submap)
+        self.tally.wall_s = self._wall_s()
+        state = ResumeState(
+            session=self._session,
+            finished_index=submap.index,
+            next_frame=next_frame,
+            tally=self.tally.to_json(),
+            wire_bytes=self._earlier_sizes,
+            opening=opening,
+        )
+        await uplink.put(Finished(submap, state))
+        so_far = Tally.from_json(state.tally)
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._io_threads, self._checkpoint, so_far)
 
     def _count(self, result: FrameResult) -> None:
         self.tally.add_frame(result)
@@ -224,4 +270,5 @@ class Agent:
             await self._client.finish_agent(self._session, self._name)
             self.tally.completed = True
         except (Unavailable, DeadlineExceeded) as error:
+            await asyncio.get_running_loop().run_in_executor(self._io_threads, self._spool.clear)
             log.warning("%s: could not say goodbye: %s", self._name, error)

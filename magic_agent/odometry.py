@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from magic_agent.slam_config import SubmapConfig
 from magic_core.data import Frame
-from magic_core.geometry import se3
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import Camera, se3
 from magic_core.submap import Descriptor, OdometryEdge, TrackedFrame
 
 Pose = NDArray[np.float64]
@@ -41,7 +42,42 @@ class ActiveSubmap:
         count = len(self.trajectory)
         far = float(np.linalg.norm(anchor_from_camera[:3, 3])) > config.translation_m
         turned = float(np.rad2deg(se3.rotation_angle(anchor_from_camera))) > config.rotation_deg
-        return count >= config.frames or (count >= config.min_frames and (far or turned))
+        if count >= config.frames or count < config.min_frames:
+            return count >= config.frames
+        return far or turned or overlap() < config.min_anchor_overlap
+
+
+def anchor_overlap(
+    anchor_depth: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    *,
+    camera: Camera,
+    anchor_from_camera: Pose,
+) -> float:
+    """Share of a frame's depth readings (h, w) whose surface the anchor's depth image shows too."""
+    points = camera.back_project(depth)[::_THIN, ::_THIN][depth[::_THIN, ::_THIN] > 0.0]
+    if not len(points):
+        return 1.0  # nothing is known, so nothing is known to have left the view
+    seen = se3.transform_points(anchor_from_camera, points)
+    z = np.maximum(seen[:, 2], 1e-6)
+    u = np.rint(camera.fx * seen[:, 0] / z + camera.cx)
+    v = np.rint(camera.fy * seen[:, 1] / z + camera.cy)
+    inside = (seen[:, 2] > 0.0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    there = anchor_depth[v[inside].astype(int), u[inside].astype(int)]
+    hidden = (there > 0.0) & (z[inside] > _BEHIND * there)
+    return float((~hidden).sum()) / len(points)
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """How a sub-map begins."""
+
+    frame: Frame
+    """Its anchor."""
+    odometry: OdometryEdge | None
+    """From the sub-map before; None begins a new chain."""
+    carried: GaussianCloud | None
+    """The Gaussians that moved over, in the anchor's frame."""
 
 
 def hand_over_edge(

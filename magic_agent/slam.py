@@ -12,13 +12,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.mapping.mapper import Mapper, MappingBudget, MappingReport
-from magic_agent.odometry import ActiveSubmap, hand_over_edge
+from magic_agent.memory import SubmapMemory
+from magic_agent.odometry import ActiveSubmap, Opening, hand_over_edge
+from magic_agent.resume import ResumePoint
 from magic_agent.slam_config import SlamConfig
 from magic_agent.tracking import Tracker, TrackingResult
 from magic_agent.tracking.refinement import CloudView, ReferenceView
@@ -53,6 +55,8 @@ class FrameResult:
     is_keyframe: bool
     finished: Submap | None
     """The sub-map that this frame closed."""
+    opening: Opening | None = None
+    """How the sub-map begins that this frame opened."""
     tracked: TrackingResult | None = None
     """What the tracker said; None for the first frame of a chain."""
     mapped: MappingReport | None = None
@@ -82,6 +86,7 @@ class LocalSlam:
         describe: Describe,
         first_submap_index: int = 0,
         world_from_anchor_prior: Pose | None = None,
+        resume: ResumePoint | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         config.submap.validate()
@@ -100,6 +105,10 @@ class LocalSlam:
         self._last_step_s = 0.0
         self._seen: RenderedView | None = None
         self._lost_in_a_row = 0
+        self._opening: Opening | None = None
+        self._memory: SubmapMemory | None = None
+        if resume is not None:
+            self._resume(resume)
 
     @property
     def mapper(self) -> Mapper:
@@ -125,6 +134,17 @@ class LocalSlam:
             return self._on_lost(frame, self._active, tracked, tracking_ms, mapping_s)
         return self._on_tracked(frame, self._active, tracked, tracking_ms, mapping_s)
 
+    def _resume(self, point: ResumePoint) -> None:
+        """Go on where an earlier process was: its last hand-over, or only the sub-map before."""
+        self._next_index = point.next_index
+        if point.memory is not None:
+            self._memory = SubmapMemory(point.memory, self._config)
+        if point.opening is not None:
+            opening = point.opening
+            self._begin(
+                opening.frame, odometry=opening.odometry, carried=opening.carried, mapping_s=None
+            )
+
     def finish(self) -> Submap | None:
         """Close the last sub-map, all its Gaussians included; None where there is none."""
         if self._active is None:
@@ -138,7 +158,7 @@ class LocalSlam:
         if not self._usable(frame):
             return self._result(frame, self._next_index, se3.identity(), lost=True)
         started = self._clock()
-        mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
+        mapped = self._begin(frame, odometry=self._remembered_edge(frame), mapping_s=mapping_s)
         return self._result(
             frame,
             self._next_index - 1,
@@ -188,10 +208,37 @@ class LocalSlam:
             return None
         found = self._tracker.relocalise(frame, self._mapper.keyframes, reference=self._reference())
         self._seen = None  # The last view that was tried need not be the right one.
+        found = found or self._found_in_memory(frame)
         if found is not None:
             log.info("agent %s: frame %d found again in its sub-map", self._agent, frame.index)
             self._tracker.reset()
         return found
+
+    def _found_in_memory(self, frame: Frame) -> TrackingResult | None:
+        """The pose, in the active sub-map, of a frame found in the one before the restart."""
+        active, memory = self._active, self._memory
+        if active is None or memory is None or active.odometry is None:
+            return None
+        if active.odometry.previous_index != memory.submap.index:
+            return None
+        found = memory.find(frame, self._tracker)
+        if found is None:
+            return None
+        anchor_from_memory = se3.inverse(active.odometry.previous_from_anchor)
+        return replace(found, anchor_from_camera=anchor_from_memory @ found.anchor_from_camera)
+
+    def _remembered_edge(self, frame: Frame) -> OdometryEdge | None:
+        """The edge from the sub-map before the restart to a frame that is found in it."""
+        memory, self._memory = self._memory, None
+        found = None if memory is None else memory.find(frame, self._tracker)
+        if memory is None or found is None:
+            return None
+        self._tracker.reset()
+        index = memory.submap.index
+        log.info("agent %s: frame %d found in sub-map %d", self._agent, frame.index, index)
+        return hand_over_edge(
+            index, found.anchor_from_camera, found.information, self._config.submap
+        )
 
     def _remember(self, frame: Frame, anchor_from_camera: Pose) -> None:
         """Note a frame that has a pose: the next one is tracked from here."""
@@ -273,7 +320,7 @@ class LocalSlam:
             self._agent, self._lost_in_a_row, frame.index, self._next_index,
         )  # fmt: skip
         started = self._clock()
-        finished = self._submap(active, self._mapper.gaussians())
+        finished, self._memory = self._submap(active, self._mapper.gaussians()), None
         self._tracker.reset()
         mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
         return self._result(
@@ -292,7 +339,7 @@ class LocalSlam:
     ) -> tuple[Submap, MappingReport]:
         sent, kept = self._mapper.split(edge.previous_from_anchor)
         finished = self._submap(active, sent)
-        before = self._before_last
+        before, self._memory = self._before_last, None
         mapped = self._begin(frame, odometry=edge, carried=kept, mapping_s=mapping_s)
         if before is not None:  # the motion goes on across the seam
             self._before_last = se3.inverse(edge.previous_from_anchor) @ before
@@ -307,6 +354,7 @@ class LocalSlam:
         mapping_s: float | None,
     ) -> MappingReport:
         """Start the next sub-map with this frame as anchor."""
+        self._opening = Opening(frame, odometry, carried)
         self._active = ActiveSubmap(
             index=self._next_index,
             odometry=odometry,
@@ -367,6 +415,7 @@ class LocalSlam:
             lost=lost,
             is_keyframe=mapped is not None,
             finished=finished,
+            opening=self._opening if finished is not None else None,
             tracked=tracked,
             mapped=mapped,
             skipped_keyframe=skipped_keyframe,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import resource
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +75,24 @@ class Tally:
             (frame.timestamp_s, self._odometry_from_anchor @ frame.anchor_from_camera)
             for frame in submap.trajectory
         ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON takes it; `from_json` gives it again."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        values["wire_bytes"] = [[size.compact, size.lossless] for size in self.wire_bytes]
+        values["_odometry_from_anchor"] = self._odometry_from_anchor.tolist()
+        values["_tracked"] = [[time_s, pose.tolist()] for time_s, pose in self._tracked]
+        return {name: list(v) if isinstance(v, list) else v for name, v in values.items()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Tally:
+        """The tally of `to_json`'s values."""
+        known = {each.name for each in fields(cls)}
+        tally = cls(**{name: value for name, value in values.items() if name in known})
+        tally.wire_bytes = [WireBytes(*sizes) for sizes in values["wire_bytes"]]
+        tally._odometry_from_anchor = np.array(values["_odometry_from_anchor"])
+        tally._tracked = [(time_s, np.array(pose)) for time_s, pose in values["_tracked"]]
+        return tally
 
     def trajectory(self) -> Trajectory:
         """The tracked trajectory: odometry alone, no correction."""

@@ -12,9 +12,11 @@ import logging
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 
 from magic_agent.client import MagicClient
 from magic_agent.config import UplinkConfig
+from magic_agent.resume import ResumeState
 from magic_agent.spool import Spool
 from magic_core.errors import DeadlineExceeded, MagicError, ResourceExhausted, Unavailable
 from magic_core.evaluation import WireBytes
@@ -26,6 +28,15 @@ log = logging.getLogger(__name__)
 
 QUEUE_SUBMAPS = 2
 """Finished sub-maps that wait to be encoded; when there are more, mapping waits for the disk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A finished sub-map, and where the agent goes on behind it."""
+
+    submap: Submap
+    state: ResumeState
+    """Its `wire_bytes` are those of an earlier process; the uplink adds its own."""
 
 
 class Uplink:
@@ -47,13 +58,16 @@ class Uplink:
         self._executor = executor
         self._on_spooled = on_spooled
         self._on_receipt = on_receipt
-        self._finished: asyncio.Queue[Submap | None] = asyncio.Queue(QUEUE_SUBMAPS)
+        self._finished: asyncio.Queue[Finished | None] = asyncio.Queue(QUEUE_SUBMAPS)
+        # What an earlier process left may be on the server in part.
+        self._left_over = frozenset(spool.pending())
         self._spooled = asyncio.Event()
         self._closed = False
+        self._spooled_sizes: list[WireBytes] = []
 
-    async def put(self, submap: Submap) -> None:
+    async def put(self, finished: Finished) -> None:
         """Take a finished sub-map; returns at once while the queue has room."""
-        await self._finished.put(submap)
+        await self._finished.put(finished)
 
     async def close(self) -> None:
         """No more sub-maps will come; `run` returns once the last is acknowledged."""
@@ -67,20 +81,26 @@ class Uplink:
 
     async def _store_all(self) -> None:
         loop = asyncio.get_running_loop()
-        while (submap := await self._finished.get()) is not None:
-            sizes = await loop.run_in_executor(self._executor, self._encode_and_store, submap)
-            self._on_spooled(submap.index, sizes)
+        while (finished := await self._finished.get()) is not None:
+            sizes = await loop.run_in_executor(self._executor, self._encode_and_store, finished)
+            self._on_spooled(finished.submap.index, sizes)
             self._spooled.set()
         self._closed = True
         self._spooled.set()
 
-    def _encode_and_store(self, submap: Submap) -> WireBytes:
+    def _encode_and_store(self, finished: Finished) -> WireBytes:
         """Both encodings are made, so that every report can say what the codec saves."""
+        submap = finished.submap
         request_id = f"{submap.agent}-{submap.index}-{uuid.uuid4().hex}"
         compact = encode_submap(submap, request_id=request_id)
         lossless = encode_submap(submap, request_id=request_id, encoding=SubmapEncoding.lossless())
-        self._spool.add(submap.index, lossless if self._config.lossless else compact)
-        return WireBytes(compact=compact.wire_bytes, lossless=lossless.wire_bytes)
+        sizes = WireBytes(compact=compact.wire_bytes, lossless=lossless.wire_bytes)
+        state = finished.state
+        state = replace(state, wire_bytes=(*state.wire_bytes, *self._spooled_sizes, sizes))
+        self._spooled_sizes.append(sizes)
+        chosen = lossless if self._config.lossless else compact
+        self._spool.add(submap.index, chosen, state=state)
+        return sizes
 
     async def _send_all(self) -> None:
         while True:
@@ -94,10 +114,11 @@ class Uplink:
     async def _send(self, index: int) -> None:
         loop = asyncio.get_running_loop()
         encoded = await loop.run_in_executor(self._executor, self._spool.load, index)
-        delay_s, waited_s = self._config.first_retry_s, 0.0
+        delay_s, waited_s, repeated = self._config.first_retry_s, 0.0, False
         while True:
             try:
-                receipt = await self._client.submit_encoded(encoded)
+                resume = repeated or index in self._left_over
+                receipt = await self._client.submit_encoded(encoded, resume=resume)
                 break
             except (Unavailable, DeadlineExceeded, ResourceExhausted) as error:
                 if waited_s >= self._config.give_up_after_s or _is_final(error):
@@ -105,6 +126,7 @@ class Uplink:
                 pause_s = max(delay_s, error.retry_after_s or 0.0)
                 log.warning("sub-map %d waits %.1f s: %s", index, pause_s, error)
             await asyncio.sleep(pause_s)
+            repeated = True
             waited_s += pause_s if self._closed else 0.0
             delay_s = min(2 * delay_s, self._config.longest_retry_s)
         await loop.run_in_executor(self._executor, self._spool.remove, index)

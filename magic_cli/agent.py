@@ -81,11 +81,19 @@ async def run_agent(command: AgentCommand) -> dict:
     from magic_agent.agent import Agent
     from magic_agent.client import ClientConfig, MagicClient
     from magic_agent.places import load_descriptor_model
+    from magic_agent.tally import Tally
     from magic_core.evaluation import RunFolder
 
     source = _source(command)
     folder = RunFolder(command.out)
     model = load_descriptor_model(command.places_model)
+
+    def keep(tally: Tally) -> None:
+        """Write the figures so far: an agent that is killed is in the report as far as it came."""
+        report = tally.report(camera=source.camera, dataset=command.dataset, scale=command.scale)
+        folder.write_agent_report(report)
+        folder.write_trajectory(command.name, "tracked", tally.trajectory())
+
     async with MagicClient(command.server, ClientConfig(credentials=command.credentials)) as client:
         agent = Agent(
             source,
@@ -96,6 +104,7 @@ async def run_agent(command: AgentCommand) -> dict:
             model=model,
             folder=folder.agents_folder / command.name,
             observer=_observer(command.progress),
+            checkpoint=keep,
         )
         loop = asyncio.get_running_loop()
         for signal_number in (signal.SIGINT, signal.SIGTERM):
@@ -103,11 +112,7 @@ async def run_agent(command: AgentCommand) -> dict:
         try:
             tally = await agent.run()
         finally:
-            report = agent.tally.report(
-                camera=source.camera, dataset=command.dataset, scale=command.scale
-            )
-            folder.write_agent_report(report)
-            folder.write_trajectory(command.name, "tracked", agent.tally.trajectory())
+            keep(agent.tally)
     return {
         "agent": command.name,
         "completed": tally.completed,

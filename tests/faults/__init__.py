@@ -1,0 +1,1 @@
+"""Faults on purpose: servers that are killed, networks that fail. Each module runs by itself."""
