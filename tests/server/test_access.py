@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import hmac
+import shutil
+import subprocess
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -406,6 +409,33 @@ async def test_a_new_certificate_is_taken_up_without_a_restart(
         authority.server()
         async with MagicClient(server.address, client_config) as client:
             assert await client.list_sessions() == ()
+
+
+async def test_the_certificates_of_the_script_work(
+    server_config: ServerConfig, tmp_path: Path
+) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl")
+    made = tmp_path / "certificates"
+    script = Path(__file__).resolve().parents[2] / "deploy" / "make-certificates"
+    await asyncio.to_thread(
+        subprocess.run, [script, made, "map.example", "robot_1"], check=True, capture_output=True
+    )
+    tls = TlsConfig(made / "server.pem", made / "server.key", made / "ca.pem")
+    (tmp_path / "tokens").write_text("robot_1 agent:sessions/room certificate:robot_1\n")
+    access = AccessConfig(tmp_path / "tokens")
+    credentials = ClientCredentials(
+        ca=made / "ca.pem",
+        certificate=made / "robot_1.pem",
+        key=made / "robot_1.key",
+        server_name="map.example",
+    )
+    async with (
+        Server(dataclasses.replace(server_config, tls=tls, access=access)) as server,
+        MagicClient(server.address, ClientConfig(credentials=credentials)) as client,
+    ):
+        await register(client)
+    assert (made / "server.key").stat().st_mode & 0o077 == 0  # noqa: ASYNC240
 
 
 def test_tls_files_that_do_not_fit_are_named(server_config: ServerConfig, tmp_path: Path) -> None:
