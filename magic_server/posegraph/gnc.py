@@ -27,16 +27,17 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-STEP = 2.0
+STEP = 4.0
 LEAST_MU = 0.002
+"""Annealing starts no wider than loops 22 times beyond their bound: the start is placed already."""
 LAST_MU = 0.5
 """Here loops count up to 3 times beyond their bound; the polish then cuts at the bound."""
-"""Annealing starts no wider than loops 22 times beyond their bound: the start is placed already."""
 MAX_ROUNDS = 30
-ITERATIONS_PER_ROUND = 2
+ITERATIONS_PER_ROUND = 1
+"""Rounds are many: weights that follow the poses closely are worth more than converged poses."""
 LEAST_WEIGHT = 1e-3
 POLISH_ROUNDS = 5
-POLISH_ITERATIONS = 4
+POLISH_ITERATIONS = 2
 FINAL_ITERATIONS = 50
 SEED_ITERATIONS = 6
 
@@ -92,11 +93,12 @@ def graduated(
     limit: float,
     seed: NDArray[np.bool_] | None,
     candidates: NDArray[np.bool_] | None = None,
+    final: bool = True,
 ) -> GncResult:
     """Anneal from nearly convex to truncated least squares; `limit` is the chi-square bound.
 
     `seed` are loops to solve with first. `candidates` keeps the annealing to some loops; the
-    polish may take up the others.
+    polish may take up the others. `final` ends at the optimum, else near it.
     """
     allowed = np.ones(len(graph.loops), bool) if candidates is None else candidates
     start = poses
@@ -113,11 +115,16 @@ def graduated(
             if mu >= LAST_MU:
                 break
             mu *= STEP
-    return polished(graph, poses, limit=limit, start=start)
+    return polished(graph, poses, limit=limit, start=start, final=final)
 
 
 def polished(
-    graph: RobustGraph, poses: Array, *, limit: float, start: Array | None = None
+    graph: RobustGraph,
+    poses: Array,
+    *,
+    limit: float,
+    start: Array | None = None,
+    final: bool = True,
 ) -> GncResult:
     """Alternate between keeping what fits and solving with it, until nothing changes."""
     start = poses if start is None else start
@@ -130,7 +137,8 @@ def polished(
         if (fits == kept).all():
             break
         kept = fits
-    poses = graph.solve(poses, kept.astype(float), max_iterations=FINAL_ITERATIONS)
+    if final:
+        poses = graph.solve(poses, kept.astype(float), max_iterations=FINAL_ITERATIONS)
     return GncResult(poses=poses, kept=kept, start=start)
 
 

@@ -26,6 +26,8 @@ Numbers = NDArray[np.int64]
 NOTICEABLE_M = 1e-5
 NOTICEABLE_RAD = 1e-6
 """A pose that moved by less is not news."""
+TRIED_PER_STEP = 8
+"""Loops that a step tries to take up; more than that wait for the solve of the whole graph."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,12 +141,13 @@ class OnlineGraph:
         A `solution` of the graph as `arrays` gave it is adopted first.
         """
         touched, self._touched = self._touched, set()
-        if solution is not None:
-            self._adopt(solution)
+        again = self._adopt(solution) if solution is not None else ()
         for vertex in vertices:
             touched.add(self._add_vertex(vertex))
-        for loop in loops:
-            touched |= self._tried(self._add_loop(loop))
+        added = [self._add_loop(loop) for loop in loops]
+        for number in (*again, *added)[-TRIED_PER_STEP:]:
+            touched |= self._tried(number)
+        self.unsettled |= bool(again or added)
         every = np.arange(len(self)) if solution is not None else None
         return self._news(np.array(sorted(touched), dtype=np.int64) if every is None else every)
 
@@ -159,8 +162,11 @@ class OnlineGraph:
             initial=self.poses.copy(),
         )
 
-    def _adopt(self, solution: ArraySolution) -> None:
-        """Take over a solve of the graph as it was; what came since is placed again on top."""
+    def _adopt(self, solution: ArraySolution) -> list[int]:
+        """Take over a solve of the graph as it was; sub-maps that came since are placed on top.
+
+        Returns the loops that came since, of which none counts any more.
+        """
         count, loops = len(solution.poses), len(solution.kept)
         self.poses[:count] = solution.poses
         self.component[:count] = solution.component
@@ -169,9 +175,10 @@ class OnlineGraph:
         for number in range(count, len(self)):
             self._place(number)
         self._count_members()
-        for number in range(loops, len(self._loops)):
+        since = list(range(loops, len(self._loops)))
+        for number in since:
             self._keep(number, False)
-            self._tried(number)
+        return since
 
     # Adding
 
@@ -234,7 +241,6 @@ class OnlineGraph:
 
     def _tried(self, number: int) -> set[int]:
         """Take up a loop if that is certain; the vertices that moved. In doubt, none does."""
-        self.unsettled = True
         source, target = self._loop_edges.one(number).ends(0)
         if self._config.robust == "none" or self.component[source] != self.component[target]:
             return set()

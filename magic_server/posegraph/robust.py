@@ -160,7 +160,8 @@ class RobustSolver:
         )
         sizes = support.cluster_size[inside]
         seed = sizes >= SEED_SHARE * sizes.max()
-        return graduated(alone, self._chains.poses[members], limit=limit, seed=seed)
+        start = self._chains.poses[members]
+        return graduated(alone, start, limit=limit, seed=seed, final=False)
 
     def _description_cost(self, result: GncResult, scale: float) -> float:
         """Negative log-likelihood (nats, up to a constant) of noise `scale` times the claimed.
