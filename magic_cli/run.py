@@ -24,6 +24,8 @@ from magic_agent.config import AgentConfig
 from magic_cli.options import parse
 from magic_cli.output import console, print_json
 from magic_core.config import field_names, save_yaml
+from magic_core.errors import ConfigError
+from magic_server.access import AccessConfig
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.globalmap import MergeConfig
 from magic_server.jobs import JobConfig
@@ -137,6 +139,7 @@ def server_settings(config: RunConfig, folder: Path) -> ServerConfig:
     return ServerConfig(
         data_dir=folder,
         listen=ListenConfig(port=0),
+        access=AccessConfig(tokens_env=""),  # callers of another server are none of this one's
         jobs=config.jobs,
         loops=dataclasses.replace(config.candidates, enabled=config.loops == "on"),
         registration=config.registration,

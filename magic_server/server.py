@@ -27,7 +27,7 @@ from magic_core.wire import server_options
 from magic_server.access import AccessControl
 from magic_server.audit import AuditLog
 from magic_server.calls import CallDesk
-from magic_server.config import ServerConfig
+from magic_server.config import LOOPBACK, ServerConfig
 from magic_server.drain import Gate
 from magic_server.globalmaps import GlobalMaps
 from magic_server.interceptors import CallInterceptor
@@ -149,7 +149,8 @@ class Server:
             "TLS" if self.config.tls.enabled else "plaintext",
             self.config.data_dir,
         )
-        if self.access.open and self.config.tls.client_ca is None:
+        beyond = self.config.listen.host not in LOOPBACK
+        if beyond and self.access.open and self.config.tls.client_ca is None:
             logger.warning("no tokens are configured: whoever can connect may do everything")
 
     async def stop(self) -> None:

@@ -37,6 +37,7 @@ from magic_server.tokens import parse_tokens
 from tests.certificates import Authority
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 SECRET = "{}-0123456789abcdef"
 TABLE = """
 # name     scope                                secret
@@ -417,7 +418,7 @@ async def test_the_certificates_of_the_script_work(
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
     made = tmp_path / "certificates"
-    script = Path(__file__).resolve().parents[2] / "deploy" / "make-certificates"
+    script = REPOSITORY / "deploy" / "make-certificates"
     await asyncio.to_thread(
         subprocess.run, [script, made, "map.example", "robot_1"], check=True, capture_output=True
     )
@@ -435,7 +436,7 @@ async def test_the_certificates_of_the_script_work(
         MagicClient(server.address, ClientConfig(credentials=credentials)) as client,
     ):
         await register(client)
-    assert (made / "server.key").stat().st_mode & 0o077 == 0  # noqa: ASYNC240
+    assert (made / "server.key").stat().st_mode & 0o077 == 0
 
 
 def test_tls_files_that_do_not_fit_are_named(server_config: ServerConfig, tmp_path: Path) -> None:

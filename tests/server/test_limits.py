@@ -414,3 +414,37 @@ async def test_a_submap_above_the_limits_is_refused_for_good(server_config: Serv
         with pytest.raises(ResourceExhausted, match="this server takes 1000") as caught:
             await client.submit_submap(make_submap())
         assert caught.value.retry_after_s is None
+
+
+async def test_a_call_that_runs_out_of_memory_is_refused_for_now(
+    server: Server, client: MagicClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def greedy(**_: object) -> None:
+        bytearray(1 << 62)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(server._store.agents, "session_page", greedy)
+        async with MagicClient(server.address, NO_RETRY) as impatient:
+            with pytest.raises(MemoryLow) as caught:
+                await impatient.list_sessions()
+    assert caught.value.retry_after_s
+    assert await client.list_sessions() == ()
+
+
+@pytest.mark.slow
+async def test_a_server_whose_memory_is_taken_refuses_and_recovers(
+    server_config: ServerConfig,
+) -> None:
+    """With real memory: 3 GB are taken and given back."""
+    available = available_memory()
+    if available < 8 << 30:
+        pytest.skip("needs 8 GB of free memory")
+    resources = ResourceConfig(min_available_bytes=available - (3 << 29))
+    async with serving(dataclasses.replace(server_config, resources=resources)) as (_, client):
+        await register(client)
+        ballast = bytearray(os.urandom(1 << 20)) * 3072
+        with pytest.raises(MemoryLow):
+            await client.submit_submap(make_submap())
+        assert await client.list_submaps("room") == ()
+        del ballast
+        await client.submit_submap(make_submap())
