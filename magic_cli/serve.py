@@ -6,12 +6,16 @@ Examples:
   magic serve --host 0.0.0.0 --tls.certificate server.pem --tls.key server.key \\
               --access.tokens-file tokens --metrics.port 9464
   magic serve --host 0.0.0.0 --insecure             # plaintext in a network you trust
+  magic serve --viewer                              # and the map in the browser while it grows
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import os
+import subprocess
 import sys
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -21,6 +25,7 @@ import tyro
 from magic_cli.options import parse
 from magic_cli.output import console
 from magic_core import logs, tracing
+from magic_core.errors import ConfigError
 from magic_server.config import ListenConfig, ServerConfig
 
 
@@ -30,6 +35,10 @@ class ServeCommand(ServerConfig):
 
     listen: Annotated[ListenConfig, tyro.conf.arg(name="")] = field(default_factory=ListenConfig)
     """Where the server listens."""
+    viewer: bool = False
+    """Serve the live view too, as a process of its own: `magic view` on this server."""
+    viewer_port: int = 8080
+    """Port of the live view; the next free one where it is taken."""
     progress: Literal["text", "json"] = "text"
     """`json` prints one line with the address on stdout once the server is ready."""
 
@@ -37,6 +46,12 @@ class ServeCommand(ServerConfig):
 def main(arguments: list[str]) -> int:
     """Serve until told to stop; 0 after a clean end."""
     command = parse(ServeCommand, arguments, prog="magic serve", description=__doc__ or "")
+    asks_for_tokens = command.access.tokens_file or os.environ.get(command.access.tokens_env)
+    if command.viewer and (command.tls.enabled or asks_for_tokens):
+        raise ConfigError(
+            "--viewer opens a plain connection without a token, which this server refuses; "
+            "start `magic view HOST:PORT --credentials...` with a reader's token instead"
+        )
     logs.configure(command.logs)
     tracing.configure(command.tracing, service="magic-server")
     from magic_server.server import Server, serve
@@ -53,5 +68,23 @@ def main(arguments: list[str]) -> int:
             if server.metrics_address is not None:
                 console.print(f"Metrics at http://{server.metrics_address}/metrics", markup=False)
 
-    asyncio.run(serve(command, on_ready=ready))
+        if command.viewer:
+            viewers.append(_start_viewer(target, command.viewer_port))
+
+    viewers: list[subprocess.Popen] = []
+    try:
+        asyncio.run(serve(command, on_ready=ready))
+    finally:
+        for viewer in viewers:
+            viewer.terminate()
+            viewer.wait()
     return 0
+
+
+def _start_viewer(target: str, port: int) -> subprocess.Popen:
+    """The live view of this server, at low priority: watching never slows the run."""
+    arguments = [sys.executable, "-m", "magic_cli", "view", target, "--port", str(port)]
+    viewer = subprocess.Popen(arguments, stdin=subprocess.DEVNULL)
+    with contextlib.suppress(AttributeError, OSError):  # a courtesy that not every system has
+        os.setpriority(os.PRIO_PROCESS, viewer.pid, 5)
+    return viewer

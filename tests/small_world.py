@@ -119,7 +119,7 @@ def make_submap(
         agent=f"agent_{agent}",
         index=index,
         camera=camera,
-        gaussians=_gaussians(camera, *images[0]),
+        gaussians=gaussians_of(camera, *images[0]),
         keyframes=tuple(Keyframe(start + i, time_of[i], poses[i], *images[i]) for i in kept),
         trajectory=tuple(
             TrackedFrame(start + i, time_of[i], poses[i], lost=i == 2) for i in range(frames)
@@ -130,7 +130,7 @@ def make_submap(
     )
 
 
-def _gaussians(
+def gaussians_of(
     camera: Camera, colour: NDArray[np.uint8], depth: NDArray[np.float32]
 ) -> GaussianCloud:
     """One flat Gaussian per second pixel, facing the camera."""

@@ -1,0 +1,138 @@
+"""What the viewer keeps of a session: sub-maps in their own frames, and one pose for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import Camera, se3
+from magic_core.submap import Keyframe, Submap
+from magic_core.wire import names
+from magic_core.wire.records import AgentInfo, LoopCandidate, PoseSnapshot
+
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SubmapView:
+    """One sub-map as it is drawn; nothing in it changes when the pose graph moves."""
+
+    name: str
+    """Resource name."""
+    agent: str
+    index: int
+    camera: Camera
+    cloud: GaussianCloud  # anchor frame
+    path: NDArray[np.float64]  # (n, 4, 4) anchor_from_camera of its frames
+    times_s: tuple[float, ...]
+    """Their timestamps."""
+    keyframes: tuple[Keyframe, ...]
+    previous: tuple[int, Pose] | None
+    """Index of the sub-map before, and previous_from_anchor as it was tracked."""
+
+    @classmethod
+    def of(cls, submap: Submap) -> SubmapView:
+        """From a sub-map as downloaded."""
+        edge = submap.odometry
+        return cls(
+            name=submap.name,
+            agent=submap.agent,
+            index=submap.index,
+            camera=submap.camera,
+            cloud=submap.gaussians,
+            path=np.stack([frame.anchor_from_camera for frame in submap.trajectory]),
+            times_s=tuple(frame.timestamp_s for frame in submap.trajectory),
+            keyframes=submap.keyframes,
+            previous=(edge.previous_index, edge.previous_from_anchor) if edge else None,
+        )
+
+
+@dataclass(slots=True)
+class SessionView:
+    """The newest state of one session."""
+
+    session: str
+    submaps: dict[str, SubmapView] = field(default_factory=dict)
+    """By resource name, in order of arrival."""
+    snapshot: PoseSnapshot | None = None
+    loops: tuple[LoopCandidate, ...] = ()
+    agents: tuple[AgentInfo, ...] = ()
+    merged: dict[str, GaussianCloud] = field(default_factory=dict)
+    """Component -> its newest merged map, world frame of the component."""
+
+    def world_from_anchor(self) -> dict[str, Pose]:
+        """The corrected pose of every known sub-map; each component stands beside the one before.
+
+        Components have no common frame, so the picture sets them apart along x.
+        """
+        if self.snapshot is None:
+            return {}
+        offsets = self._offsets()
+        return {
+            name: offsets[pose.component] @ pose.world_from_anchor
+            for name, pose in self.snapshot.poses.items()
+            if name in self.submaps
+        }
+
+    def component_offset(self, component: str) -> Pose:
+        """Where a component's world frame stands in the picture."""
+        return self._offsets().get(component, se3.identity())
+
+    def tracked(self) -> dict[str, Pose]:
+        """The poses without any correction: each chain of odometry from its first sub-map on."""
+        corrected = self.world_from_anchor()
+        found: dict[str, Pose] = {}
+        for name, view in self.submaps.items():
+            if name not in corrected:
+                continue
+            before = None
+            if view.previous is not None:
+                before = found.get(_sibling(name, view.previous[0]))
+            found[name] = (
+                corrected[name] if before is None or view.previous is None
+                else before @ view.previous[1]
+            )  # fmt: skip
+        return found
+
+    def world_from_cameras(self, agent: str, anchors: dict[str, Pose]) -> list[NDArray[np.float64]]:
+        """(n, 4, 4) poses of the frames of each sub-map of an agent, in order."""
+        return [
+            anchors[view.name] @ view.path
+            for view in self.submaps.values()
+            if view.agent == agent and view.name in anchors
+        ]
+
+    def agent_names(self) -> tuple[str, ...]:
+        """Agents that have sent something, sorted."""
+        return tuple(sorted({view.agent for view in self.submaps.values()}))
+
+    def _offsets(self) -> dict[str, Pose]:
+        assert self.snapshot is not None
+        offsets: dict[str, Pose] = {}
+        edge = 0.0
+        for component in self.snapshot.components:
+            positions = [
+                (pose.world_from_anchor @ self.submaps[name].path)[:, 0, 3]
+                for name, pose in self.snapshot.poses.items()
+                if pose.component == component.id and name in self.submaps
+            ]
+            low, high = 0.0, 0.0
+            if positions:
+                low = float(min(p.min() for p in positions))
+                high = float(max(p.max() for p in positions))
+            shift = 0.0 if not offsets else edge - low + _GAP_M
+            offsets[component.id] = se3.from_rotation_translation(np.eye(3), [shift, 0.0, 0.0])
+            edge = shift + high
+        return offsets
+
+
+_GAP_M = 4.0
+"""Between the paths of two components, metres: a room's width, so that maps rarely overlap."""
+
+
+def _sibling(name: str, index: int) -> str:
+    session, agent, _ = names.parse_submap(name)
+    return names.submap_name(session, agent, index)

@@ -1,0 +1,105 @@
+"""The page: a viser server, the scene, the panel, and the map rendered on request."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from magic_cli.viewer.model import SessionView
+from magic_cli.viewer.panel import Panel
+from magic_cli.viewer.scene import Scene
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry import se3
+
+
+class Page:
+    """What a browser sees; `update` is called with each new state, from one thread at a time."""
+
+    def __init__(self, *, host: str, port: int, max_splats: int) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner; ours comes from the command
+            self._server = viser.ViserServer(host=host, port=port, label="magic-slam")
+        self._lock = threading.Lock()
+        self._view: SessionView | None = None
+        self._rasteriser: Any = None
+        self._panel = Panel(self._server, render=self._rendered, export_map=self._whole_map)
+        self._scene = Scene(
+            self._server,
+            max_splats=max_splats,
+            on_anchor=self._panel.select_anchor,
+            on_loop=self._panel.select_loop,
+        )
+        self._panel.build(self._scene)
+
+    @property
+    def address(self) -> str:
+        """The page's URL."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def update(self, view: SessionView) -> None:
+        """Show the newest state."""
+        with self._lock:
+            first = self._view is None or not self._view.submaps
+            self._view = view
+            if first:
+                self._scene.look_from_outside(view)
+            self._scene.update(view)
+            self._panel.update(view)
+            self._follow(view)
+
+    def close(self) -> None:
+        """Stop serving the page."""
+        self._server.stop()
+
+    def _follow(self, view: SessionView) -> None:
+        """Put every visitor's camera behind the followed agent's newest frame."""
+        agent = self._panel.following
+        parts = view.world_from_cameras(agent, view.world_from_anchor()) if agent else []
+        if not parts:
+            return
+        pose = parts[-1][-1]
+        behind = pose[:3, 3] - 0.8 * pose[:3, 2] - 0.3 * pose[:3, 1]
+        for client in self._server.get_clients().values():
+            with client.atomic():
+                client.camera.position = tuple(behind)
+                client.camera.look_at = tuple(pose[:3, 3] + pose[:3, 2])
+
+    def _whole_map(self) -> GaussianCloud:
+        """The merged maps, or else all sub-maps at their corrected poses; the largest component."""
+        with self._lock:
+            view = self._view
+            if view is None or view.snapshot is None or not view.snapshot.components:
+                return GaussianCloud.empty()
+            return _map_of(view, view.snapshot.components[0].id)
+
+    def _rendered(self, name: str) -> NDArray[np.uint8]:
+        """The map from the pose of a sub-map's anchor, (h, w, 3)."""
+        from magic_core.render import Rasteriser
+
+        with self._lock:
+            assert self._view is not None
+            assert self._view.snapshot is not None
+            submap, pose = self._view.submaps[name], self._view.snapshot.poses[name]
+            cloud = _map_of(self._view, pose.component)
+            self._rasteriser = self._rasteriser or Rasteriser()
+            view = self._rasteriser.render(cloud, submap.camera, pose.world_from_anchor)
+        return (np.clip(view.colour, 0.0, 1.0) * 255).astype(np.uint8)
+
+
+def _map_of(view: SessionView, component: str) -> GaussianCloud:
+    """A component's map in its own world frame."""
+    if component in view.merged:
+        return view.merged[component]
+    assert view.snapshot is not None
+    return GaussianCloud.concatenate(
+        [
+            view.submaps[name].cloud.transformed(se3.orthonormalised(pose.world_from_anchor))
+            for name, pose in view.snapshot.poses.items()
+            if pose.component == component and name in view.submaps
+        ]
+    )

@@ -1,0 +1,133 @@
+"""What the viewer shows, without a browser: frames, level of detail, words."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from magic_cli.main import run_command
+from magic_cli.viewer.detail import covariances, keep_every, thinned
+from magic_cli.viewer.model import SessionView, SubmapView
+from magic_cli.viewer.panel import (
+    agents_text,
+    loop_text,
+    loop_title,
+    summary_text,
+    trajectories_zip,
+)
+from magic_core.geometry import se3
+from magic_core.wire.records import (
+    AgentInfo,
+    ComponentInfo,
+    CorrectedPose,
+    LoopCandidate,
+    PoseSnapshot,
+)
+from tests.small_world import make_submap, path
+
+
+def session(*agents_of_components: tuple[int, ...]) -> SessionView:
+    """Two sub-maps of each agent, the agents of one tuple in one component, at the true poses."""
+    view = SessionView("room")
+    poses, components = {}, []
+    for agents in agents_of_components:
+        first = make_submap(agent=agents[0]).name
+        names = []
+        for agent in agents:
+            for index in range(2):
+                submap = make_submap(agent=agent, index=index)
+                view.submaps[submap.name] = SubmapView.of(submap)
+                pose = se3.inverse(path(agents[0], 4)[0]) @ path(agent, 4)[index]
+                poses[submap.name] = CorrectedPose(submap.name, first, pose)
+                names.append(submap.name)
+        components.append(
+            ComponentInfo(
+                first, len(names), tuple(f"sessions/room/agents/agent_{a}" for a in agents)
+            )
+        )
+    view.snapshot = PoseSnapshot("sessions/room", 3, None, poses, tuple(components))
+    return view
+
+
+def test_one_component_stands_in_its_own_world_frame():
+    view = session((0, 1))
+    for name, pose in view.world_from_anchor().items():
+        np.testing.assert_allclose(pose, view.snapshot.poses[name].world_from_anchor)
+
+
+def test_components_stand_side_by_side():
+    view = session((0,), (1,))
+    anchors = view.world_from_anchor()
+    first = [p[0, 3] for n, p in anchors.items() if "agent_0" in n]
+    second = [p[0, 3] for n, p in anchors.items() if "agent_1" in n]
+    assert min(second) - max(first) > 3.5
+
+
+def test_tracked_poses_follow_the_odometry_from_the_first_sub_map():
+    view = session((0,))
+    names = list(view.submaps)
+    moved = se3.exp([0.3, 0.0, 0.1, 0.0, 0.2, 0.0])
+    old = view.snapshot.poses[names[1]]
+    view.snapshot.poses[names[1]] = CorrectedPose(
+        old.submap, old.component, old.world_from_anchor @ moved
+    )
+    tracked = view.tracked()
+    np.testing.assert_allclose(tracked[names[1]], old.world_from_anchor, atol=1e-9)
+    assert not np.allclose(view.world_from_anchor()[names[1]], old.world_from_anchor, atol=0.1)
+
+
+def test_thinning_keeps_the_limit_and_covers_the_same_surface():
+    cloud = make_submap(agent=0).gaussians
+    step = keep_every(len(cloud), 200)
+    few = thinned(cloud, step)
+    assert len(few) <= 200
+    assert step == 4
+    areas = [np.sort(c.scales, axis=1)[:, 1:].prod(axis=1).sum() for c in (cloud, few)]
+    assert areas[1] == pytest.approx(areas[0], rel=0.25)
+    np.testing.assert_allclose(few.means.mean(0), cloud.means.mean(0), atol=0.15)
+
+
+def test_covariances_are_those_of_axes_and_scales():
+    cloud = make_submap(agent=0).gaussians.transformed(se3.exp([0, 0, 0, 0.3, -0.8, 0.5]))
+    values = np.linalg.eigvalsh(covariances(cloud).astype(np.float64))
+    np.testing.assert_allclose(np.sqrt(values), np.sort(cloud.scales, axis=1), rtol=1e-2)
+
+
+def test_texts_name_verdict_reason_and_figures():
+    loop = LoopCandidate(
+        "sessions/room/agents/agent_1/submaps/3", "sessions/room/agents/agent_0/submaps/1",
+        0.71, "REJECTED", "FREE_SPACE", fitness=0.62, rmse_m=0.0123, inliers=87, overlap=0.4,
+    )  # fmt: skip
+    assert loop_title(loop) == "agent_1/3 - agent_0/1: REJECTED, FREE_SPACE"
+    text = loop_text(loop)
+    for part in ("REJECTED", "FREE_SPACE", "0.71", "0.62", "12.3 mm", "87 inliers"):
+        assert part in text
+    view = session((0, 1))
+    view.loops = (loop,)
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    view.agents = (
+        AgentInfo("sessions/room/agents/agent_0", "ACTIVE", now, now - timedelta(seconds=7), 2, 2),
+    )
+    assert "revision 3" in summary_text(view, 500)
+    assert "1 rejected" in summary_text(view, 500)
+    assert "| agent_0 | active | 7 s ago | 2 |" in agents_text(view, now=now)
+
+
+def test_exported_trajectories_hold_every_frame():
+    view = session((0, 1))
+    with zipfile.ZipFile(io.BytesIO(trajectories_zip(view))) as archive:
+        assert sorted(archive.namelist()) == ["agent_0.txt", "agent_1.txt"]
+        lines = [
+            line for line in archive.read("agent_1.txt").decode().splitlines()
+            if not line.startswith("#")
+        ]  # fmt: skip
+    assert len(lines) == 8
+
+
+def test_what_is_neither_run_nor_address_is_refused(tmp_path, capsys):
+    assert run_command(["view", str(tmp_path)]) == 1
+    assert "neither a run folder" in capsys.readouterr().err

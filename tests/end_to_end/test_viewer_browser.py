@@ -1,0 +1,184 @@
+"""The live view in a real headless Chromium, fed by a real server."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import io
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pytest_asyncio
+from PIL import Image
+
+from magic_agent.client import ClientConfig, MagicClient
+from magic_cli.viewer.feed import Feed
+from magic_cli.viewer.page import Page
+from magic_core.geometry import se3
+from magic_core.submap import Keyframe, Submap, TrackedFrame
+from magic_server.config import ListenConfig, ServerConfig
+from magic_server.jobs import JobConfig
+from magic_server.loops import LoopConfig
+from magic_server.server import Server
+from tests.small_world import DIMENSION, LARGE, MODEL_ID, look, make_submap, render
+from tests.small_world import gaussians_of as gaussians
+
+playwright = pytest.importorskip("playwright.async_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (apt-get install chromium)"),
+    pytest.mark.slow,
+]
+ARTEFACTS = Path(__file__).resolve().parents[2] / "build" / "viewer"
+BACKGROUND = np.array([22, 26, 34])
+MAP_AREA = (0, 190, 600, 600)  # left, top, right, bottom: beside the panel, below notices
+
+
+def turned_away() -> Submap:
+    """A third agent that looks at the opposite wall: a candidate that must be rejected."""
+    world_from_anchor = look(0.0, 1.2, np.pi)
+    colour, depth = render(LARGE, world_from_anchor)
+    first = make_submap(agent=2, index=0, camera=LARGE)
+    return dataclasses.replace(
+        first,
+        gaussians=gaussians(LARGE, colour, depth),
+        keyframes=(Keyframe(0, 0.0, se3.identity(), colour, depth),),
+        trajectory=(TrackedFrame(0, 0.0, se3.identity()),),
+    )
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def shown(tmp_path_factory) -> AsyncIterator[tuple[Page, Feed, MagicClient]]:
+    """A page that shows a session of three agents, after its loops were verified."""
+    config = ServerConfig(
+        data_dir=tmp_path_factory.mktemp("viewer"),
+        listen=ListenConfig(port=0, stop_grace_s=2.0),
+        jobs=JobConfig(workers=1, niceness=0),
+        loops=LoopConfig(min_similarity=-1.0),
+    )
+    async with (
+        Server(config) as server,
+        MagicClient(server.address, ClientConfig(rpc_timeout_s=60.0)) as client,
+    ):
+        for agent in range(3):
+            await client.register_agent(
+                "room", f"agent_{agent}", model_id=MODEL_ID, dimension=DIMENSION
+            )
+        for index in range(2):
+            for agent in range(2):
+                await client.submit_submap(make_submap(agent=agent, index=index, camera=LARGE))
+        await client.submit_submap(turned_away())
+        assert await (await server.sessions.named("room")).idle(timeout_s=240)
+        page = Page(host="127.0.0.1", port=8080, max_splats=20_000)
+        feed = Feed(client, session="room", draw=page.update, interval_s=0.2)
+        for _ in range(3):
+            await feed.refresh()
+        yield page, feed, client
+        page.close()
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser(shown) -> AsyncIterator:
+    """The page in Chromium, with software rendering."""
+    async with playwright.async_playwright() as driver:
+        chromium = await driver.chromium.launch(
+            executable_path=CHROMIUM,
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+                  "--ignore-gpu-blocklist", "--disable-quic"],
+        )  # fmt: skip
+        tab = await chromium.new_page(viewport={"width": 960, "height": 600})
+        tab.set_default_timeout(180_000)
+        await tab.goto(shown[0].address)
+        await tab.wait_for_selector("canvas")
+        await tab.wait_for_function("document.body.innerText.includes('5 sub-maps in')")
+        yield tab
+        await chromium.close()
+
+
+async def screenshot(tab, name: str) -> np.ndarray:
+    """A picture of the page, kept under build/viewer."""
+    ARTEFACTS.mkdir(parents=True, exist_ok=True)
+    data = await tab.screenshot(path=ARTEFACTS / f"{name}.png", timeout=180_000)
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+
+
+def shown_share(picture: np.ndarray) -> float:
+    """The share of the map's area that is not background."""
+    left, top, right, bottom = MAP_AREA
+    area = picture[top:bottom, left:right].astype(int)
+    return float((np.abs(area - BACKGROUND).max(axis=2) > 25).mean())
+
+
+async def settled_share(tab, name: str, *, least: float = 0.0, most: float = 1.0) -> float:
+    """The share once the page has drawn what it was sent."""
+    share = -1.0
+    for _ in range(40):
+        share = shown_share(await screenshot(tab, name))
+        if least <= share <= most:
+            break
+        await asyncio.sleep(1.0)
+    return share
+
+
+async def test_splats_appear_and_go_with_their_layer(browser) -> None:
+    assert await settled_share(browser, "live", least=0.1) >= 0.1
+    await browser.get_by_label("splats", exact=True).uncheck()
+    assert await settled_share(browser, "without-splats", most=0.08) < 0.08
+    await browser.get_by_label("splats", exact=True).check()
+    assert await settled_share(browser, "live", least=0.1) >= 0.1
+
+
+async def test_agents_are_listed_with_their_health(browser) -> None:
+    await browser.get_by_role("tab", name="Agents").click()
+    await browser.wait_for_function("document.body.innerText.includes('agent_2')")
+    text = await browser.inner_text("body")
+    assert "active" in text
+    assert "s ago" in text
+
+
+async def test_a_rejected_loop_tells_its_reason(shown, browser) -> None:
+    _, _, client = shown
+    loops = (await client.list_loops("room")).candidates
+    rejected = next(c for c in loops if c.verdict == "REJECTED" and "agent_2" in c.source)
+    await browser.get_by_role("tab", name="Loops").click()
+    await browser.get_by_label("candidate", exact=True).click()
+    title = f"agent_2/0 - {'/'.join(rejected.target.split('/')[3::2])}: REJECTED"
+    await browser.get_by_text(title).first.click()
+    await browser.wait_for_function(f"document.body.innerText.includes('{rejected.reason}')")
+    await screenshot(browser, "rejected-loop")
+    assert "overlap" in await browser.inner_text("body")
+
+
+async def test_a_keyframe_is_shown_beside_its_rendering(browser) -> None:
+    await browser.get_by_role("tab", name="Keyframe").click()
+    await browser.get_by_label("sub-map", exact=True).click()
+    await browser.get_by_text("agent_0/1", exact=True).first.click()
+    images = "[...document.images].filter(i => i.offsetParent && i.naturalWidth === 256).length"
+    await browser.wait_for_function(f"{images} === 2")
+    await screenshot(browser, "keyframe")
+
+
+async def test_the_map_is_exported_from_the_page(browser, tmp_path) -> None:
+    from magic_core.gaussians.ply import read_ply
+
+    await browser.get_by_role("tab", name="Export").click()
+    async with browser.expect_download() as started:
+        await browser.get_by_role("button", name="map as 3DGS PLY").click()
+    path = tmp_path / "map.ply"
+    await (await started.value).save_as(path)
+    assert len(read_ply(path)) > 10_000
+
+
+async def test_new_sub_maps_arrive_while_the_page_is_open(shown, browser) -> None:
+    _, feed, client = shown
+    await client.submit_submap(make_submap(agent=0, index=2, camera=LARGE))
+    for _ in range(100):
+        await feed.refresh()
+        if "6 sub-maps in" in await browser.inner_text("body"):
+            break
+        await asyncio.sleep(0.3)
+    assert "6 sub-maps in" in await browser.inner_text("body")
