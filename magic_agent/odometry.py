@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,9 @@ from magic_core.submap import Descriptor, OdometryEdge, TrackedFrame
 
 Pose = NDArray[np.float64]
 
+_THIN = 8  # every so many pixels are looked at, each way
+_BEHIND = 1.1  # farther than this many times the anchor's reading, a surface is hidden from it
+
 
 @dataclass(slots=True)
 class ActiveSubmap:
@@ -25,20 +29,43 @@ class ActiveSubmap:
     descriptor: Descriptor
     prior: Pose | None
     trajectory: list[TrackedFrame] = field(default_factory=list)
+    unseen: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+    """Covariance of the motion that no image showed so far, left perturbation (anchor frame)."""
 
     @property
     def last_pose(self) -> Pose:
         """anchor_from_camera of the last frame."""
         return self.trajectory[-1].anchor_from_camera
 
-    def append(self, frame: Frame, anchor_from_camera: Pose, *, lost: bool) -> None:
-        """Note one frame's pose."""
+    def append(
+        self,
+        frame: Frame,
+        anchor_from_camera: Pose,
+        *,
+        lost: bool,
+        unseen: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Note one frame's pose, and the (6, 6) covariance of a step that was guessed in part.
+
+        Frames are tracked against the map, so their errors do not add up; but a map that was
+        extended at guessed poses carries the error of the guess on.
+        """
+        if unseen is not None:
+            adjoint = se3.adjoint(anchor_from_camera)
+            self.unseen = self.unseen + adjoint @ unseen @ adjoint.T
         self.trajectory.append(
             TrackedFrame(frame.index, frame.timestamp_s, anchor_from_camera, lost)
         )
 
-    def is_due(self, anchor_from_camera: Pose, config: SubmapConfig) -> bool:
-        """Whether a frame at this pose should open the next sub-map (count, distance or turn)."""
+    def is_due(
+        self,
+        anchor_from_camera: Pose,
+        config: SubmapConfig,
+        *,
+        overlap: Callable[[], float] = lambda: 1.0,
+    ) -> bool:
+        """Whether a frame at this pose should open the next sub-map: by count, distance, turn, or
+        coverage, for which `overlap` tells how much of the frame the anchor's image shows too."""
         count = len(self.trajectory)
         far = float(np.linalg.norm(anchor_from_camera[:3, 3])) > config.translation_m
         turned = float(np.rad2deg(se3.rotation_angle(anchor_from_camera))) > config.rotation_deg
@@ -81,13 +108,19 @@ class Opening:
 
 
 def hand_over_edge(
-    index: int, anchor_from_next: Pose, information: NDArray[np.float64], config: SubmapConfig
+    index: int,
+    anchor_from_next: Pose,
+    information: NDArray[np.float64],
+    config: SubmapConfig,
+    *,
+    unseen: NDArray[np.float64] | None = None,
 ) -> OdometryEdge:
     """The odometry edge out of sub-map `index`.
 
     Its covariance is the tracker's for the last pose, plus the drift of the model itself: frames
     are tracked against the sub-map, whose far end was built from near, so the error grows with the
-    sub-map and not with the frame count. `information` is that of the tracker, (6, 6).
+    sub-map and not with the frame count. `information` is that of the tracker, (6, 6); `unseen` is
+    what `ActiveSubmap` gathered of motion that no image showed.
     """
     drift = np.concatenate(
         [
@@ -98,5 +131,8 @@ def hand_over_edge(
     # The eigenvalues are bounded below so that an undetermined direction stays a large variance.
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     covariance = (vectors / np.maximum(values, 1.0)) @ vectors.T + np.diag(drift)
+    if unseen is not None:
+        adjoint = se3.adjoint(se3.inverse(anchor_from_next))
+        covariance = covariance + adjoint @ unseen @ adjoint.T
     inverse = np.linalg.inv(covariance)
     return OdometryEdge(index, anchor_from_next, 0.5 * (inverse + inverse.T))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from magic_agent.mapping.mapper import Mapper, MappingBudget, MappingReport
 from magic_agent.memory import SubmapMemory
-from magic_agent.odometry import ActiveSubmap, Opening, hand_over_edge
+from magic_agent.odometry import ActiveSubmap, Opening, anchor_overlap, hand_over_edge
 from magic_agent.resume import ResumePoint
 from magic_agent.slam_config import SlamConfig
 from magic_agent.tracking import Tracker, TrackingResult
@@ -261,13 +261,22 @@ class LocalSlam:
         pose = tracked.anchor_from_camera
         self._remember(frame, pose)
         started = self._clock()
-        if active.is_due(pose, self._config.submap) and self._usable(frame):
-            edge = hand_over_edge(active.index, pose, tracked.information, self._config.submap)
+        due = active.is_due(
+            pose, self._config.submap, overlap=lambda: self._overlap_with_anchor(frame, pose)
+        )
+        if due and self._usable(frame):
+            edge = hand_over_edge(
+                active.index,
+                pose,
+                tracked.information,
+                self._config.submap,
+                unseen=active.unseen,
+            )
             finished, mapped = self._hand_over(frame, active, edge, mapping_s)
             pose, skipped = se3.identity(), False
         else:
             finished = None
-            active.append(frame, pose, lost=False)
+            active.append(frame, pose, lost=False, unseen=tracked.unseen_covariance)
             mapped, skipped = self._map(frame, pose, mapping_s)
         return self._result(
             frame,
@@ -279,6 +288,12 @@ class LocalSlam:
             tracked=tracked,
             mapped=mapped,
             skipped_keyframe=skipped,
+        )
+
+    def _overlap_with_anchor(self, frame: Frame, anchor_from_camera: Pose) -> float:
+        anchor = self._mapper.keyframes[0]
+        return anchor_overlap(
+            anchor.depth, frame.depth, camera=self._camera, anchor_from_camera=anchor_from_camera
         )
 
     def _map(
@@ -321,7 +336,7 @@ class LocalSlam:
         )  # fmt: skip
         started = self._clock()
         finished, self._memory = self._submap(active, self._mapper.gaussians()), None
-        self._tracker.reset()
+        self._tracker.begin_chain()
         mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
         return self._result(
             frame,
@@ -338,6 +353,8 @@ class LocalSlam:
         self, frame: Frame, active: ActiveSubmap, edge: OdometryEdge, mapping_s: float | None
     ) -> tuple[Submap, MappingReport]:
         sent, kept = self._mapper.split(edge.previous_from_anchor)
+        if self._config.submap.send_all:
+            sent = self._mapper.gaussians()
         finished = self._submap(active, sent)
         before, self._memory = self._before_last, None
         mapped = self._begin(frame, odometry=edge, carried=kept, mapping_s=mapping_s)

@@ -21,6 +21,11 @@ class SubmapConfig:
     """Distance from the anchor, in metres, that starts a new sub-map."""
     rotation_deg: float = 90.0
     """Turn from the anchor, in degrees, that starts a new sub-map."""
+    min_anchor_overlap: float = 0.1
+    """A new sub-map starts where the anchor's image shows less than this share of the frame."""
+    send_all: bool = False
+    """Send also the Gaussians that the next sub-map takes over (an ablation: the paper's sub-maps
+    are without them)."""
     max_lost_frames: int = 10
     """Usable frames in a row without a pose before a new sub-map starts without odometry."""
     min_depth_share: float = 0.1
@@ -36,6 +41,7 @@ class SubmapConfig:
             "frames": (self.frames >= 2, "expected at least 2"),
             "min_frames": (1 <= self.min_frames <= self.frames, "expected 1 to submap.frames"),
             "max_lost_frames": (self.max_lost_frames >= 1, "expected at least 1"),
+            "min_anchor_overlap": (0.0 <= self.min_anchor_overlap < 1.0, "expected 0 to 1"),
             "min_depth_share": (0.0 <= self.min_depth_share < 1.0, "expected 0 to 1"),
             "drift_translation_m": (self.drift_translation_m > 0, "expected more than 0 m"),
             "drift_rotation_deg": (self.drift_rotation_deg > 0, "expected more than 0 degrees"),

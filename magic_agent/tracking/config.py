@@ -129,6 +129,12 @@ class RelocalisationConfig:
     """Reprojection error of an inlier, at most."""
     min_inliers: int = 15
     """Keypoints that must support a pose."""
+    shape_every: int = 4
+    """Of the frames lost in a row every so many are registered by shape, where keypoints fail."""
+    shape_keyframes: int = 2
+    """Keyframes that a frame is registered with by shape: those with most descriptors in common."""
+    min_shape_inliers: int = 10
+    """Matches of shape that must support a pose."""
     refined: int = 3
     """Best hypotheses that are refined against the sub-map."""
     min_inlier_share: float = 0.6

@@ -36,9 +36,9 @@ from magic_core.render.linearisation import linearise
 
 Float64 = NDArray[np.float64]
 
-_SUSPICIOUS_PER_PIXEL = 0.3
+_SUSPICIOUS_PER_PIXEL = 0.12
 """Relative information per visible pixel below which a direction is probed. Textured rooms have
-0.2 to 1.5 in their weakest direction, the noise of a bare corridor 0.04."""
+mostly more in their weakest direction, the noise of a bare corridor 0.04."""
 _NOISE = 0.05
 """A rise of the cost below this share of the predicted one is noise. Measured: texture 0.1 to 1,
 noise below 0.01."""

@@ -1,9 +1,11 @@
 """Where in a sub-map was this frame taken, without any idea of the last pose?
 
 Keypoints of the frame are matched with those of the sub-map's keyframes, whose depth makes them
-points of the anchor frame. Perspective-n-point with RANSAC gives one pose per keyframe; the best
-few are refined against the rendered sub-map, and one is accepted only if the refined view agrees
-with the frame as well as a tracked one must, and refinement stayed near the hypothesis.
+points of the anchor frame. Perspective-n-point with RANSAC gives one pose per keyframe. Where
+keypoints do not suffice, the depth images are registered by shape, with the keyframes whose
+descriptors match best. The best few hypotheses are refined against the rendered sub-map, and one is
+accepted only if the refined view agrees with the frame as well as a tracked one must, and
+refinement stayed near the hypothesis.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from numpy.typing import NDArray
 
 from magic_agent.tracking.config import RelocalisationConfig
 from magic_agent.tracking.result import TrackingResult
+from magic_agent.tracking.shape_registration import match_shapes, points_of
+from magic_core.data import Frame
 from magic_core.geometry import Camera, se3
 from magic_core.submap import Keyframe
 
@@ -26,10 +30,11 @@ Refine = Callable[[Pose], TrackingResult]
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose that keypoints of one keyframe support."""
+    """A pose that one keyframe supports."""
 
     anchor_from_camera: Pose
     inliers: int
+    """Keypoints, or matches of shape, that agree on it."""
     keyframe_index: int
     """Frame index of the keyframe."""
 
@@ -50,35 +55,60 @@ class Relocaliser:
         self._config = config
         self._sift = cv2.SIFT_create(nfeatures=config.keypoints)  # pyright: ignore
         self._kept: dict[int, tuple[Keyframe, _Features]] = {}
+        self._failures = 0
 
     def relocalise(
-        self, colour: NDArray[np.uint8], keyframes: Sequence[Keyframe], *, refine: Refine
+        self, frame: Frame, keyframes: Sequence[Keyframe], *, refine: Refine
     ) -> TrackingResult | None:
-        """The refined pose of an image (h, w, 3) in the sub-map, or None if none convinces.
+        """The refined pose of a frame in the sub-map, or None if no hypothesis convinces.
 
+        Registration by shape is slow: of the frames lost in a row only every few are tried.
         refine: refines a pose hypothesis `anchor_from_camera` against the rendered sub-map.
         """
+        found = self._best(self.hypotheses(frame.colour, keyframes), refine)
+        if found is None and self._failures % self._config.shape_every == 0:
+            found = self._best(self.shape_hypotheses(frame, keyframes), refine)
+        self._failures = self._failures + 1 if found is None else 0
+        return found
+
+    def hypotheses(
+        self, colour: NDArray[np.uint8], keyframes: Sequence[Keyframe]
+    ) -> list[Hypothesis]:
+        """Poses that enough keypoints support, those with most first."""
+        frame = self._features(colour)
+        found = [self._hypothesis(frame, keyframe) for keyframe in keyframes]
+        self._forget(keyframes)
+        return _most_first([each for each in found if each is not None])
+
+    def shape_hypotheses(self, frame: Frame, keyframes: Sequence[Keyframe]) -> list[Hypothesis]:
+        """Poses by shape from the keyframes with most descriptors in common, best first."""
+        source = points_of(frame.depth, self._camera)
+        found = []
+        for keyframe in self._likeliest(frame.colour, keyframes):
+            match = match_shapes(source, points_of(keyframe.depth, self._camera))
+            if match is not None and match.inliers >= self._config.min_shape_inliers:
+                pose = keyframe.anchor_from_camera @ match.target_from_source
+                found.append(Hypothesis(pose, match.inliers, keyframe.frame_index))
+        return _most_first(found)
+
+    def _likeliest(
+        self, colour: NDArray[np.uint8], keyframes: Sequence[Keyframe]
+    ) -> list[Keyframe]:
+        frame = self._features(colour)
+        common = [len(self._matches(frame, self._keyframe_features(each))) for each in keyframes]
+        order = sorted(range(len(keyframes)), key=lambda i: -common[i])
+        return [keyframes[i] for i in order[: self._config.shape_keyframes]]
+
+    def _best(self, hypotheses: Sequence[Hypothesis], refine: Refine) -> TrackingResult | None:
+        """The result that agrees best with the sub-map among those that convince."""
         best = None
-        for hypothesis in self.hypotheses(colour, keyframes)[: self._config.refined]:
+        for hypothesis in hypotheses[: self._config.refined]:
             result = refine(hypothesis.anchor_from_camera)
             if self._convinces(hypothesis, result) and (
                 best is None or result.inlier_share > best.inlier_share
             ):
                 best = result
         return best
-
-    def hypotheses(
-        self, colour: NDArray[np.uint8], keyframes: Sequence[Keyframe]
-    ) -> list[Hypothesis]:
-        """Poses with enough inliers, those with most first."""
-        frame = self._features(colour)
-        found = []
-        for keyframe in keyframes:
-            hypothesis = self._hypothesis(frame, keyframe)
-            if hypothesis is not None and hypothesis.inliers >= self._config.min_inliers:
-                found.append(hypothesis)
-        self._forget(keyframes)
-        return sorted(found, key=lambda each: -each.inliers)
 
     def _convinces(self, hypothesis: Hypothesis, result: TrackingResult) -> bool:
         if result.lost or result.inlier_share < self._config.min_inlier_share:
@@ -106,7 +136,7 @@ class Relocaliser:
             reprojectionError=self._config.reprojection_px,
             flags=cv2.SOLVEPNP_EPNP,
         )
-        if not ok or inliers is None:
+        if not ok or inliers is None or len(inliers) < self._config.min_inliers:
             return None
         camera_from_keyframe = se3.from_rotation_translation(
             se3.rotation_exp(rotation.ravel()), translation.ravel()
@@ -160,3 +190,7 @@ class Relocaliser:
         x = (pixels[:, 0] - self._camera.cx) / self._camera.fx * z
         y = (pixels[:, 1] - self._camera.cy) / self._camera.fy * z
         return np.stack([x, y, z], axis=1)
+
+
+def _most_first(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    return sorted(hypotheses, key=lambda each: -each.inliers)

@@ -44,8 +44,8 @@ class TrackingResult:
     renders: int
     """Renders of the sub-map that were needed."""
     stages_ms: dict[str, float]
-    """Wall time by stage: pyramid, rotation, initialisation, render, refinement, verdict; for a
-    lost frame also relocalisation."""
+    """Wall time by stage: pyramid, rotation, initialisation, render, refinement, verdict; or
+    relocalisation alone where that found the pose."""
 
     @property
     def lost(self) -> bool:
@@ -57,6 +57,13 @@ class TrackingResult:
         """Of the images' information in units of the motion prior: infinite where degenerate."""
         least, largest = float(self.eigenvalues[0]), float(self.eigenvalues[-1])
         return largest / least if least > 1e-9 * max(largest, 1e-300) else float("inf")
+
+    @property
+    def unseen_covariance(self) -> NDArray[np.float64] | None:
+        """(6, 6) of a degenerate pose, which the motion prior determines in part; else None."""
+        if self.verdict != "degenerate":
+            return None
+        return np.asarray(np.linalg.inv(self.information), np.float64)
 
     @property
     def total_ms(self) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,11 +156,16 @@ class Tracker:
         """Find a frame in the active sub-map from its keyframes alone; None if it is not there."""
         if self._relocaliser is None:
             self._relocaliser = Relocaliser(self._camera, self._config.relocalisation)
-        return self._relocaliser.relocalise(
-            frame.colour,
-            keyframes,
-            refine=lambda pose: self.refine(frame, anchor_from_camera=pose, reference=reference),
-        )
+        clock = StageClock()
+        with clock.stage("relocalisation"):
+            found = self._relocaliser.relocalise(
+                frame,
+                keyframes,
+                refine=lambda pose: self.refine(
+                    frame, anchor_from_camera=pose, reference=reference
+                ),
+            )
+        return None if found is None else replace(found, stages_ms=clock.stages_ms)
 
     def _turned(self, previous: Pyramid, current: Pyramid, predicted: Pose) -> Pose:
         """The prediction, turned where tiny images show a turn that it did not foresee."""
