@@ -1,13 +1,15 @@
 """One run on this machine: a server, one process per agent, and the session that they share.
 
-Whatever happens to single agents, the run goes on: what arrived is merged. A first Ctrl-C lets
-the agents leave early and still merges; a second one ends at once.
+Whatever happens to single agents, the run goes on: what arrived is merged. A Ctrl-C ends the stage
+it comes in: mapping (the agents finish their sub-maps, send them, and the run merges), then merging
+(the sub-maps are kept as they were appended). A further one ends at once.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import signal
 import time
 from dataclasses import dataclass, field
@@ -48,12 +50,13 @@ class LocalRun:
         self._sources = sources
         self._folder = folder
         self._agents: list[Child] = []
-        self._interrupts = 0
+        self._interrupted = False
+        self._merging: asyncio.Future | None = None
         self._outcome = Outcome()
 
     async def run(self) -> Outcome:
         """Run to the end. Raises DataError when not a single sub-map arrived."""
-        with self._interruptible(), RunProgress(self._sources) as progress:
+        with RunProgress(self._sources) as progress, self._interruptible(progress):
             server = await self._start_server()
             try:
                 target = (await processes.wait_ready(server, timeout_s=SERVER_START_TIMEOUT_S))[
@@ -120,26 +123,45 @@ class LocalRun:
             if not await client.list_sessions() or not await client.list_submaps(SESSION):
                 logs = self._folder.agents_folder
                 raise DataError(f"no sub-map reached the server; see the agents' logs in {logs}")
+            await collect(client, SESSION, self._folder)  # what is cheap: merging may be cut short
             start = time.perf_counter()
-            limits = {"timeout_s": self._config.merge_timeout_s, "progress": progress.merge}
-            await collect_map(client, SESSION, self._folder, coarse=True, **limits)
-            info = await collect_map(client, SESSION, self._folder, **limits)
+            self._outcome.gaussians = await self._merge(client, progress)
             self._outcome.merge_s = time.perf_counter() - start
-            self._outcome.gaussians = info.gaussian_count
             await collect(client, SESSION, self._folder)
 
+    async def _merge(self, client: MagicClient, progress: RunProgress) -> int:
+        """Fetch the appended and the refined map; a Ctrl-C meanwhile keeps the appended one."""
+        limits = {"timeout_s": self._config.merge_timeout_s, "progress": progress.merge}
+        appended = await collect_map(client, SESSION, self._folder, coarse=True, **limits)
+        self._merging = asyncio.ensure_future(collect_map(client, SESSION, self._folder, **limits))
+        try:
+            return (await self._merging).gaussian_count
+        except asyncio.CancelledError:
+            if asyncio.current_task().cancelling():  # type: ignore[union-attr]
+                raise
+            progress.say("Merging was interrupted: the map holds the sub-maps as they were sent.")
+            await asyncio.to_thread(shutil.copyfile, self._folder.coarse_map_path,
+                                    self._folder.map_path)  # fmt: skip
+            return appended.gaussian_count
+
     @contextlib.contextmanager
-    def _interruptible(self):
+    def _interruptible(self, progress: RunProgress):
         loop = asyncio.get_running_loop()
         task = asyncio.current_task()
         assert task is not None
 
         def interrupt() -> None:
-            self._interrupts += 1
-            if self._interrupts > 1 or not self._agents:
+            running = [child for child in self._agents if child.exit_code is None]
+            if running and not self._interrupted:
+                progress.say("Interrupted: agents finish and send their sub-maps, then the map is "
+                             "merged. Ctrl-C again ends at once.")  # fmt: skip
+                for child in running:
+                    processes.ask_to_stop(child)
+            elif self._merging is not None and not self._merging.done():
+                self._merging.cancel()
+            else:
                 task.cancel()
-            for child in self._agents:
-                processes.ask_to_stop(child)
+            self._interrupted = True
 
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, interrupt)

@@ -6,6 +6,7 @@ import time
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -30,7 +31,7 @@ class RunProgress:
         self._tasks: dict[str, TaskID] = {}
         self._figures: dict[str, dict] = {}
         self._lengths = {source.name: len(source) for source in sources}
-        self._last_line_s = time.monotonic()
+        self._last_line_s = self._started_s = time.monotonic()
         self._merge_stage = ""
 
     def __enter__(self) -> Self:
@@ -77,7 +78,7 @@ class RunProgress:
             )
         elif time.monotonic() - self._last_line_s > PLAIN_INTERVAL_S:
             self._last_line_s = time.monotonic()
-            self.say(self._line())
+            self.say(self._line(self._last_line_s - self._started_s))
 
     def agent_ended(self, name: str, state: str) -> None:
         """An agent's process ended."""
@@ -96,10 +97,22 @@ class RunProgress:
             self._bars.update(self._tasks["map"], completed=round(100 * share), note=stage)
         self._merge_stage = stage
 
-    def _line(self) -> str:
+    def _line(self, elapsed_s: float) -> str:
+        """All agents in one line: how far, how fast, how long still."""
         parts = [
             f"{name} {self._figures.get(name, {}).get('frames', 0)}/{length}"
             for name, length in self._lengths.items()
         ]
         revision = max((f.get("revision", 0) for f in self._figures.values()), default=0)
-        return f"frames: {', '.join(parts)}; pose graph revision {revision}"
+        done = sum(figures.get("frames", 0) for figures in self._figures.values())
+        rate = done / max(elapsed_s, 1e-6)
+        left_s = (sum(self._lengths.values()) - done) / rate if done else float("inf")
+        left = f", {_minutes(left_s)} left" if np.isfinite(left_s) else ""
+        return (
+            f"frames: {', '.join(parts)}; {rate:.1f} frames/s{left}; pose graph revision {revision}"
+        )
+
+
+def _minutes(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"

@@ -7,6 +7,10 @@ Examples:
   magic run ~/recordings/office --scale 0.5
   magic run DATASET --tracking.solver adam --json
   magic run DATASET --config runs/office/config.yaml --out runs/again
+
+Ctrl-C ends early: agents send what they have, it is merged, and the run folder is complete. While
+merging, Ctrl-C keeps the sub-maps as they were sent. Exit codes: 0 done, 1 failed, 2 usage, 130 by
+a further Ctrl-C.
 """
 
 from __future__ import annotations
@@ -91,13 +95,17 @@ def run(config: RunConfig) -> dict:
     from magic_core.evaluation import RunFolder
 
     start = time.perf_counter()
+    _refuse_live(config.dataset)
     sources = open_dataset(
         config.dataset, scale=config.scale, max_frames=config.frames, stride=config.stride
     )
     folder = RunFolder(config.out or default_out(config.dataset)).create()
     save_yaml(config, folder.config_path)
     compile_kernels()
-    outcome = asyncio.run(LocalRun(config, sources, folder).run())
+    try:
+        outcome = asyncio.run(LocalRun(config, sources, folder).run())
+    except asyncio.CancelledError:  # by a Ctrl-C that came too early, or once more
+        raise KeyboardInterrupt from None
     from magic_cli.evaluation import measure
 
     metrics = measure(
@@ -110,6 +118,15 @@ def run(config: RunConfig) -> dict:
     )
     print_summary(metrics, folder)
     return metrics
+
+
+def _refuse_live(dataset: str) -> None:
+    """A run reads its frames again to measure; what a camera showed is gone by then."""
+    if dataset.startswith("realsense:"):
+        raise ConfigError(
+            f"{dataset}: a live camera cannot be read twice; start `magic serve --data-dir DIR` "
+            f"and then `magic agent {dataset} --server HOST:PORT`"
+        )
 
 
 def compile_kernels() -> None:
