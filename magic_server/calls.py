@@ -60,7 +60,7 @@ class Call:
 
     def note(self, request: Any) -> None:
         """Remember what a request is about, for logs, traces and the audit log."""
-        self.resources = resources_of(self.rule, request)
+        self.resources = tuple(name[:256] for name in resources_of(self.rule, request))
         source = request.header if _has(request, "header") else request
         self.request_id = getattr(source, "request_id", "")[:128]
         ids = _ids(self.resources)
@@ -196,7 +196,9 @@ class CallDesk:
 def _ids(resources: tuple[str, ...]) -> dict[str, str]:
     """session, agent and submap of a resource name, as far as it has them."""
     parts = resources[0].split("/")[:6] if resources else []
-    return dict(zip(_KINDS, (part[:64] for part in parts[1::2]), strict=False))
+    # What is no name yet may hold line breaks, which would forge lines of a text log.
+    values = (part[:64] if part.isprintable() else ascii(part[:64]) for part in parts[1::2])
+    return dict(zip(_KINDS, values, strict=False))
 
 
 def _has(message: Any, field_name: str) -> bool:

@@ -9,6 +9,7 @@ in a line like this:
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
@@ -62,7 +63,8 @@ class NativeLog:
         for line in self._lines:
             found = _LINE.match(line)
             if found is None:
-                os.write(self._stderr, line)
+                with contextlib.suppress(OSError):  # nobody reads; whoever writes must not wait
+                    os.write(self._stderr, line)
                 continue
             level, place, message = found.groups()
             if message.startswith(_HANDSHAKE):

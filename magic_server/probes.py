@@ -16,6 +16,8 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 
 from magic_core.errors import ConfigError, Unavailable
 
+MAX_READERS = 32
+"""Connections answered at a time; further ones are closed."""
 _TEXT = (("Content-Type", "text/plain; charset=utf-8"),)
 
 
@@ -82,6 +84,22 @@ class ProbePort:
 
 class _ThreadingServer(socketserver.ThreadingMixIn, WSGIServer):
     daemon_threads = True
+
+    def __init__(self, *arguments: Any) -> None:
+        self._places = threading.BoundedSemaphore(MAX_READERS)
+        super().__init__(*arguments)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if not self._places.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A reader that went away is no news."""

@@ -38,6 +38,7 @@ def server_options(transport: Transport = Transport()) -> list[tuple[str, int]]:
         *_common(transport),
         ("grpc.http2.min_ping_interval_without_data_ms", int(transport.keepalive_s * 500)),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", int(transport.keepalive_s * 500)),
+        ("grpc.max_concurrent_streams", 1000),  # of one connection; gRPC's own default is endless
         ("grpc.so_reuseport", 0),
     ]
 

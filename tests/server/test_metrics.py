@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
+import http.client
 import json
 import logging
 import urllib.error
@@ -12,6 +14,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+from magicslam.v1 import session_service_pb2 as session_pb
 from prometheus_client import CollectorRegistry, Counter
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -24,7 +27,7 @@ from magic_server.access import AccessConfig
 from magic_server.audit import AuditConfig, AuditEntry, AuditLog
 from magic_server.config import ServerConfig
 from magic_server.native_log import handshake_reason
-from magic_server.probes import MetricsConfig
+from magic_server.probes import MAX_READERS, MetricsConfig
 from magic_server.server import Server
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
@@ -235,3 +238,29 @@ async def test_a_line_of_a_call_says_whom_it_is_about(
     with caplog.at_level(logging.INFO), pytest.raises(NotFound):
         await client.list_submaps("room", agent="agent_7")
     assert {"session": "room", "agent": "agent_7"} in seen
+
+
+async def test_a_name_that_is_none_forges_no_log_line(
+    server: Server, client: MagicClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.handler.addFilter(lambda record: logs._add_ids(record))
+    caplog.handler.setFormatter(logs.TextFormatter())
+    request = session_pb.GetAgentRequest(name="sessions/a\nmagic_server INFO forged/agents/b")
+    with caplog.at_level(logging.INFO), pytest.raises(InvalidInput):
+        await client.idempotent(client.session_stub.GetAgent, request)
+    assert "forged" in caplog.text
+    assert not any(line.startswith("magic_server INFO") for line in caplog.text.splitlines())
+
+
+async def test_only_so_many_readers_of_metrics_are_answered(watched: Server) -> None:
+    host, _, port = str(watched.metrics_address).rpartition(":")
+    slow = [await asyncio.open_connection(host, int(port)) for _ in range(MAX_READERS)]
+    with pytest.raises((urllib.error.URLError, OSError, http.client.HTTPException)):
+        await get(watched, "/livez")
+    for _, writer in slow:
+        writer.close()
+    async with asyncio.timeout(20):
+        while True:
+            with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
+                assert (await get(watched, "/livez"))[0] == 200
+                break
