@@ -7,7 +7,9 @@ from typing import Any
 
 import grpc
 import grpc.aio
+from google.protobuf.message import DecodeError
 
+from magic_core.errors import InvalidInput
 from magic_server.access import OPEN_TO_ALL
 from magic_server.calls import CallDesk
 
@@ -34,7 +36,7 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         wrap = self._stream if handler.response_streaming else self._single
         return make(
             wrap(method, getattr(handler, kind), streamed=handler.request_streaming),
-            request_deserializer=handler.request_deserializer,
+            request_deserializer=_lenient(handler.request_deserializer),
             response_serializer=handler.response_serializer,
         )
 
@@ -44,8 +46,8 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         """A behaviour with one answer; `streamed` says whether its requests are many."""
 
         async def single(request: Any, context: Context) -> Any:
-            async with self._desk.handling(method, context, None if streamed else request) as call:
-                given = call.authorised(request) if streamed else request
+            async with self._desk.handling(method, context, _whole(request, streamed)) as call:
+                given = call.authorised(_readable(request)) if streamed else _require(request)
                 answer = await behaviour(given, context)
                 call.count(answer)
                 return answer
@@ -59,12 +61,45 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
         that goes away ends it at once and in its own task."""
 
         async def stream(request: Any, context: Context) -> None:
-            async with self._desk.handling(method, context, None if streamed else request) as call:
-                given = call.authorised(request) if streamed else request
+            async with self._desk.handling(method, context, _whole(request, streamed)) as call:
+                given = call.authorised(_readable(request)) if streamed else _require(request)
                 async for answer in behaviour(given, context):
                     await context.write(answer)
 
         return stream
+
+
+class Unreadable:
+    """What came in place of a message: bytes that do not parse."""
+
+
+def _lenient(parse: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
+    """A parser for gRPC, which calls it INTERNAL when one fails, though the caller is to blame."""
+
+    def parsed(data: bytes) -> Any:
+        try:
+            return parse(data)
+        except DecodeError:
+            return Unreadable()
+
+    return parsed
+
+
+def _whole(request: Any, streamed: bool) -> Any:
+    """The one request of a call; None where there are many, or what came is none."""
+    return None if streamed or isinstance(request, Unreadable) else request
+
+
+def _require(request: Any) -> Any:
+    if isinstance(request, Unreadable):
+        raise InvalidInput("the request's bytes are not its message; is the contract the same?")
+    return request
+
+
+async def _readable(requests: AsyncIterator[Any]) -> AsyncIterator[Any]:
+    """The messages of a stream; InvalidInput at the first that does not parse."""
+    async for request in requests:
+        yield _require(request)
 
 
 _KINDS: dict[tuple[bool, bool], tuple[str, Any]] = {
