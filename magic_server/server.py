@@ -46,6 +46,7 @@ from magic_server.signals import stop_signals
 from magic_server.store import Store
 from magic_server.tls import server_credentials
 
+from magic_server.upkeep import Upkeep
 logger = logging.getLogger(__name__)
 
 SERVICES = tuple(
@@ -118,6 +119,9 @@ class Server:
 
     async def __aexit__(self, *_: object) -> None:
         await self.stop()
+        self._upkeep = Upkeep(
+            self._store, threads=self._threads, interval_s=config.limits.upkeep_interval_s
+        )
 
     @property
     def address(self) -> str:
@@ -146,6 +150,8 @@ class Server:
         logger.info(
             "serving on %s (%s), data in %s",
             self.address,
+            self._upkeep.start()
+            await self._previews.start()
             "TLS" if self.config.tls.enabled else "plaintext",
             self.config.data_dir,
         )
@@ -173,6 +179,7 @@ class Server:
         await self._audit.close()
         if self._probes is not None:
             await asyncio.to_thread(self._probes.close)
+        await self._upkeep.close()
         self._threads.shutdown(wait=True)
 
     async def _listen(self) -> None:

@@ -15,6 +15,7 @@ from magic_core.errors import FieldViolation, MagicError
 
 DOMAIN = "magicslam"
 MAX_DETAIL_CHARACTERS = 2000
+_BREAKS = ("Internal error from Core", "Received RST_STREAM", "RST_STREAM", "Stream removed")
 
 
 def status_of(error: MagicError) -> status_pb2.Status:
@@ -50,9 +51,16 @@ def error_of(call: grpc.RpcError) -> MagicError:
     message = call.details() or code.name  # type: ignore[attr-defined]
     reason, violations, retry_after_s = _details(call)
     kind = error_class(reason, code.name)
+    if reason is None and _is_broken(code.name, message):
+        kind = errors.Unavailable
     if kind is MagicError and reason is None:
         message = f"{code.name}: {message}"
     return kind(message, violations=violations, retry_after_s=retry_after_s)
+
+
+def _is_broken(code: str, message: str) -> bool:
+    """Whether a call failed on its way: gRPC has no one code for a connection that breaks."""
+    return code in ("INTERNAL", "UNKNOWN", "CANCELLED") and message.startswith(_BREAKS)
 
 
 def error_class(reason: str | None, code: str) -> type[MagicError]:

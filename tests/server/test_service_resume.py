@@ -254,3 +254,19 @@ async def test_uploads_that_broke_off_are_bounded_and_expire(server_config: Serv
     (folder / "stray").mkdir()
     async with Server(config):
         assert list(folder.iterdir()) == []
+
+
+async def test_files_that_nothing_refers_to_are_collected_while_the_server_runs(
+    server_config: ServerConfig,
+) -> None:
+    limits = ServiceLimits(upkeep_interval_s=0.1)
+    config = dataclasses.replace(server_config, limits=limits)
+    async with Server(config) as server, MagicClient(server.address) as client:
+        await register(client)
+        await client.submit_encoded(encoded())
+        kept = set(server._store.blobs.names())
+        stray = server._store.blobs.path("ab" * 32)
+        stray.write_bytes(b"left by a transaction that failed")
+        await eventually(lambda: not stray.exists())
+        assert set(server._store.blobs.names()) == kept
+        assert (await client.download_encoded(NAME)).blobs == encoded().blobs
