@@ -18,7 +18,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=50, help="anchor every n frames")
     parser.add_argument("--scale", type=float, default=0.5, help="image scale")
     parser.add_argument(
-        "--methods", nargs="+", default=["visual+kiss", "visual", "kiss", "fpfh"],
+        "--methods", nargs="+", default=["visual+kiss", "visual", "kiss", "fpfh", "means"],
         help="coarse methods; + tries several for each pair",
     )  # fmt: skip
     parser.add_argument("--models", nargs="*", default=["efficientnet_lite0"])

@@ -9,14 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from tyro.conf import Positional
 
 from magic_cli.options import parse
 from magic_cli.output import console, print_json, table
-
-Method = Literal["visual", "kiss", "fpfh"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +26,7 @@ class LoopsBenchmark:
     """Every n-th frame of an agent is an anchor."""
     scale: float = 0.5
     """Process images at this fraction of their size."""
-    methods: tuple[str, ...] = ("visual", "visual+kiss", "kiss", "fpfh")
+    methods: tuple[str, ...] = ("visual", "visual+kiss", "kiss", "fpfh", "means")
     """Coarse registration methods, `+` joins those that are tried together."""
     models: tuple[str, ...] = ("efficientnet_lite0",)
     """Image encoders: names, or paths of ONNX files."""

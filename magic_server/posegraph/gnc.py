@@ -27,19 +27,32 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-STEP = 4.0
 LEAST_MU = 0.002
 """Annealing starts no wider than loops 22 times beyond their bound: the start is placed already."""
 LAST_MU = 0.5
 """Here loops count up to 3 times beyond their bound; the polish then cuts at the bound."""
 MAX_ROUNDS = 30
-ITERATIONS_PER_ROUND = 1
-"""Rounds are many: weights that follow the poses closely are worth more than converged poses."""
 LEAST_WEIGHT = 1e-3
 POLISH_ROUNDS = 5
 POLISH_ITERATIONS = 2
 FINAL_ITERATIONS = 50
 SEED_ITERATIONS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Annealing:
+    """How fast graduated non-convexity goes from nearly convex to truncated least squares."""
+
+    step: float
+    """Factor of the control parameter mu from round to round."""
+    iterations: int
+    """Levenberg-Marquardt iterations per round."""
+
+
+CAREFUL = Annealing(step=2.0, iterations=2)
+"""From a start that drift may have carried far away."""
+SWIFT = Annealing(step=4.0, iterations=1)
+"""From a start that most loops agree with already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +106,7 @@ def graduated(
     limit: float,
     seed: NDArray[np.bool_] | None,
     candidates: NDArray[np.bool_] | None = None,
+    annealing: Annealing = CAREFUL,
     final: bool = True,
 ) -> GncResult:
     """Anneal from nearly convex to truncated least squares; `limit` is the chi-square bound.
@@ -110,11 +124,11 @@ def graduated(
         mu = max(limit / max(2.0 * largest - limit, 1e-9), LEAST_MU)
         for _ in range(MAX_ROUNDS):
             weights = np.where(allowed, _weights(squared, mu, limit), 0.0)
-            poses = graph.solve(poses, weights, max_iterations=ITERATIONS_PER_ROUND)
+            poses = graph.solve(poses, weights, max_iterations=annealing.iterations)
             squared = graph.loops.squared_norms(poses)
             if mu >= LAST_MU:
                 break
-            mu *= STEP
+            mu *= annealing.step
     return polished(graph, poses, limit=limit, start=start, final=final)
 
 

@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from magic_server.posegraph.arrays import connected_sets
 from magic_server.posegraph.chains import Chains, shortened
 from magic_server.posegraph.consistency import LocalSupport, local_support, odometry_miss
-from magic_server.posegraph.gnc import GncResult, RobustGraph, graduated, polished
+from magic_server.posegraph.gnc import (
+    SWIFT,
+    GncResult,
+    RobustGraph,
+    graduated,
+    polished,
+)
 from magic_server.posegraph.placement import known_frames, place
 from magic_server.posegraph.problem import PoseGraphConfig
 
@@ -112,7 +118,7 @@ class RobustSolver:
             return graduated(graph, start, limit=limit, seed=seed, candidates=trusted)
         chains = self._straightened(support, trusted, limit)
         start = self._placed(chains, trusted, scale=scale)
-        return graduated(graph, start, limit=limit, seed=None, candidates=trusted)
+        return graduated(graph, start, limit=limit, seed=None, candidates=trusted, annealing=SWIFT)
 
     def _lacks_witness(self, support: LocalSupport, scale: float) -> Mask:
         """Loops that alone would move a map farther than one witness may."""

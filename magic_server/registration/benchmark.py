@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from magic_core.data import open_dataset
 from magic_core.errors import DataError
-from magic_core.geometry import se3
+from magic_core.gaussians.seeding import seed_uniform
+from magic_core.geometry import Camera, se3
 from magic_core.submap import Descriptor
 from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.register import RegistrationResult, register
@@ -29,6 +30,8 @@ OVERLAP_BINS = ((0.3, 0.5), (0.5, 0.7), (0.7, 1.01))
 LOOP_OVERLAP = 0.3
 """Pairs that overlap by this much are what detection should find."""
 STRIDE = 3
+SEEDED_SHARE = 0.25
+"""Gaussians per pixel of the method `means`."""
 DEPTH_TOLERANCE_M = 0.08
 
 Progress = Callable[[float, str], None]
@@ -56,7 +59,13 @@ class Criteria:
 def run(
     dataset: Path | str | Sequence[Path | str],
     *,
-    methods: Sequence[tuple[str, ...]] = (("visual", "kiss"), ("visual",), ("kiss",), ("fpfh",)),
+    methods: Sequence[tuple[str, ...]] = (
+        ("visual", "kiss"),
+        ("visual",),
+        ("kiss",),
+        ("fpfh",),
+        ("means",),
+    ),
     describers: Mapping[str, Describe] | None = None,
     every: int = 30,
     scale: float = 0.5,
@@ -108,10 +117,23 @@ def load_anchors(dataset: Path | str, *, every: int, scale: float) -> list[Ancho
             frame = source[number]
             if frame.world_from_camera is None:
                 raise DataError(f"{dataset}: {source.name} has no ground truth poses")
-            view = AnchorView(source.camera, frame.colour, frame.depth)
+            means = _seeded_means(source.camera, frame.colour, frame.depth)
+            view = AnchorView(source.camera, frame.colour, frame.depth, means=means)
             name = str(Path(str(dataset)).name)
             found.append(Anchor(name, source.name, number, frame.world_from_camera, view))
     return found
+
+
+def _seeded_means(
+    camera: Camera, colour: NDArray[np.uint8], depth: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Where a sub-map that begins here seeds its Gaussians, by the paper's uniform sample."""
+    count = max(1, int(SEEDED_SHARE * depth.size))
+    seeds = seed_uniform(
+        colour, depth, camera, need=depth > 0, count=count,
+        existing=np.zeros((0, 3), np.float32), rng=np.random.default_rng(0),
+    )  # fmt: skip
+    return seeds.means
 
 
 def true_overlap(source: Anchor, target: Anchor) -> float:

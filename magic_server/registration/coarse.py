@@ -44,4 +44,4 @@ def coarse_method(name: Method) -> CoarseMethod:
         return KissMatching()
     from magic_server.registration.fpfh import FpfhRansac
 
-    return FpfhRansac()
+    return FpfhRansac(name)

@@ -7,7 +7,8 @@ from typing import Literal
 
 from magic_core.errors import ConfigError
 
-Method = Literal["visual", "kiss", "fpfh"]
+Method = Literal["visual", "kiss", "fpfh", "means"]
+METHODS: tuple[Method, ...] = ("visual", "kiss", "fpfh", "means")
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +18,8 @@ class RegistrationConfig:
 
     methods: tuple[Method, ...] = ("visual", "kiss")
     """Coarse methods, each giving hypotheses: `visual` (SIFT with depth), `kiss` (KISS-Matcher),
-    `fpfh` (the paper's FPFH + RANSAC)."""
+    `fpfh` (the paper's FPFH + RANSAC), `means` (the same on the means of a sub-map's Gaussians, the
+    paper's ablation; an image that is to be localised has none)."""
     seed: int = 0
     """Seed of all random sampling; the same views give the same result."""
     max_hypotheses: int = 3
@@ -72,10 +74,10 @@ class RegistrationConfig:
     """Least eigenvalue of the information, 1/m^2 and 1/rad^2 (100: 10 cm, 0.1 rad)."""
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.methods if name not in ("visual", "kiss", "fpfh")]
+        unknown = [name for name in self.methods if name not in METHODS]
         if unknown or not self.methods:
             raise ConfigError.field(
-                "registration.methods", f"{self.methods}: expected some of visual, kiss, fpfh"
+                "registration.methods", f"{self.methods}: expected some of {', '.join(METHODS)}"
             )
         if self.pyramid_levels < 1 or self.max_hypotheses < 1 or self.max_keyframes < 0:
             raise ConfigError.field(

@@ -32,6 +32,8 @@ class AnchorView:
     depth: Float32  # (h, w) metres, 0 = no reading
     keyframes: tuple[tuple[Pose, NDArray[np.uint8], Float32], ...] = ()
     """Further images as (anchor_from_camera (4, 4), colour, depth), same camera."""
+    means: Float32 | None = None
+    """(n, 3) means of the sub-map's Gaussians, anchor frame; the method `means` needs them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,7 @@ class PreparedView:
     keypoints: Float32  # (k, 3) in the anchor frame, metres
     keypoint_frames: NDArray[np.int64]  # (k,) which frame shows the keypoint
     keypoint_descriptors: Float32  # (k, 128) RootSIFT
+    means: Float32  # (g, 3) of the Gaussians, in the anchor frame, metres; none where not given
 
 
 def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
@@ -87,6 +90,7 @@ def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
         keypoints=np.concatenate([points for points, _ in keypoints]),
         keypoint_frames=np.concatenate(owners).astype(np.int64),
         keypoint_descriptors=np.concatenate([descriptors for _, descriptors in keypoints]),
+        means=np.zeros((0, 3), np.float32) if view.means is None else view.means,
     )
 
 

@@ -47,6 +47,21 @@ def test_each_method_finds_the_transform_from_nothing(room, method):
     assert radians < 0.003
 
 
+def test_gaussian_means_register_and_are_needed(room):
+    config = RegistrationConfig(methods=("means",))
+    assert register(room.view(FIRST), room.view(SECOND), config).reason == "NO_HYPOTHESIS"
+    views = []
+    for at in (FIRST, SECOND):
+        view = room.view(at)
+        points = view.camera.back_project(view.depth)[view.depth > 0]
+        views.append(replace(view, means=points[::3].astype(np.float32)))
+    result = register(views[0], views[1], config)
+    assert result.accepted, result
+    assert result.method == "means"
+    metres, _ = errors(result.target_from_source, se3.inverse(SECOND) @ FIRST)
+    assert metres < 0.006
+
+
 def test_the_two_directions_agree(room):
     forward = register(room.view(FIRST), room.view(SECOND), CONFIG)
     back = register(room.view(SECOND), room.view(FIRST), CONFIG)
