@@ -68,9 +68,9 @@ class ServiceLimits:
     """An upload without a message for this long is ended, seconds."""
     partial_uploads: PartialUploadLimits = field(default_factory=PartialUploadLimits)
     """What is kept of uploads that broke off."""
-    io_threads: int = 4
     upkeep_interval_s: float = 600.0
     """How often files are looked for that nobody will ask for again, seconds."""
+    io_threads: int = 4
     """Threads that write, hash and check what is received."""
     drain_timeout_s: float = 120.0
     """How long a merge waits for loops that are still being verified, seconds."""

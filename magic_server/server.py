@@ -45,8 +45,8 @@ from magic_server.sessions import Sessions
 from magic_server.signals import stop_signals
 from magic_server.store import Store
 from magic_server.tls import server_credentials
-
 from magic_server.upkeep import Upkeep
+
 logger = logging.getLogger(__name__)
 
 SERVICES = tuple(
@@ -111,6 +111,9 @@ class Server:
         self._receiver = SubmapReceiver(
             self._store, threads=self._threads, limits=config.limits, quotas=self.quotas
         )
+        self._upkeep = Upkeep(
+            self._store, threads=self._threads, interval_s=config.limits.upkeep_interval_s
+        )
         self._probes: ProbePort | None = None
 
     async def __aenter__(self) -> Self:
@@ -119,9 +122,6 @@ class Server:
 
     async def __aexit__(self, *_: object) -> None:
         await self.stop()
-        self._upkeep = Upkeep(
-            self._store, threads=self._threads, interval_s=config.limits.upkeep_interval_s
-        )
 
     @property
     def address(self) -> str:
@@ -142,6 +142,7 @@ class Server:
             await self._store.open()
             await self.sessions.start()
             await self._maps.start()
+            self._upkeep.start()
             self.gate.open()
             await self._set_ready(True)
         except BaseException:
@@ -150,8 +151,6 @@ class Server:
         logger.info(
             "serving on %s (%s), data in %s",
             self.address,
-            self._upkeep.start()
-            await self._previews.start()
             "TLS" if self.config.tls.enabled else "plaintext",
             self.config.data_dir,
         )
@@ -171,6 +170,7 @@ class Server:
                 logger.warning("%d calls did not end in time and are cut", self.gate.calls)
             await self._grpc.stop(LAST_ANSWERS_S)
             self._grpc = None
+        await self._upkeep.close()
         await self._receiver.close()
         await self._maps.close()
         await self.sessions.close()
@@ -179,7 +179,6 @@ class Server:
         await self._audit.close()
         if self._probes is not None:
             await asyncio.to_thread(self._probes.close)
-        await self._upkeep.close()
         self._threads.shutdown(wait=True)
 
     async def _listen(self) -> None:
