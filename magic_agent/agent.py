@@ -22,18 +22,19 @@ from numpy.typing import NDArray
 from magic_agent.client import MagicClient
 from magic_agent.config import AgentConfig
 from magic_agent.frame_report import FrameReport
+from magic_agent.odometry import Opening
 from magic_agent.pace import Pace
 from magic_agent.places import DescriptorModel
-from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.restart import Restart, find_restart
 from magic_agent.resume import ResumePoint, ResumeState
+from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.spool import Spool
 from magic_agent.tally import Tally
 from magic_agent.uplink import Finished, Uplink
 from magic_core.data import EndOfFrames, Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
-from magic_core.geometry import se3
 from magic_core.evaluation import WireBytes
+from magic_core.geometry import se3
 from magic_core.render import warm_up
 from magic_core.submap import Submap
 from magic_core.wire import names
@@ -59,10 +60,10 @@ class Agent:
         model: DescriptorModel,
         folder: Path,
         observer: Observer = lambda event, figures: None,
-    ) -> None:
         checkpoint: Callable[[Tally], None] = lambda tally: None,
-        self.tally = Tally(name)
+    ) -> None:
         """`checkpoint` is called on a thread with the figures so far whenever a sub-map is done."""
+        self.tally = Tally(name)
         self.corrections: dict[int, CorrectedPose] = {}
         """Newest correction per sub-map index."""
         self._source = source
@@ -72,10 +73,10 @@ class Agent:
         self._config = config
         self._model = model
         self._observer = observer
-        self._spool = Spool(folder / "spool")
         self._checkpoint = checkpoint
         self._earlier_sizes: tuple[WireBytes, ...] = ()
         self._earlier_wall_s = 0.0
+        self._spool = Spool(folder / "spool")
         self._frame_report = FrameReport(folder)
         self._stopping = asyncio.Event()
         self._frames: asyncio.Queue[Frame | None] = asyncio.Queue(config.queue_frames)
@@ -269,6 +270,6 @@ class Agent:
         try:
             await self._client.finish_agent(self._session, self._name)
             self.tally.completed = True
-        except (Unavailable, DeadlineExceeded) as error:
             await asyncio.get_running_loop().run_in_executor(self._io_threads, self._spool.clear)
+        except (Unavailable, DeadlineExceeded) as error:
             log.warning("%s: could not say goodbye: %s", self._name, error)
