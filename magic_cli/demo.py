@@ -2,6 +2,11 @@
 
 The flat is rendered by the project itself; nothing is downloaded. Everything that `magic run` can
 be told, `magic demo` can be told too.
+
+Examples:
+  magic demo
+  magic demo --frames 60 --out runs/quick
+  magic demo --flat.agents 2 --data runs/two --json
 """
 
 from __future__ import annotations

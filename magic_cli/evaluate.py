@@ -1,4 +1,11 @@
-"""`magic eval RUN`: measure a finished run again and rewrite its report."""
+"""`magic eval RUN`: measure a finished run again and rewrite its report.
+
+Also measures a run that was cut short. Ground truth and images are read from the dataset again.
+
+Examples:
+  magic eval runs/office
+  magic eval runs/office --dataset /mnt/disk/office --no-report --json
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,9 @@
 """`magic posegraph solve FILE...`: solve pose graphs in g2o files with the server's own solver.
 
-Several files are read as one graph, one robot each. Example:
+Several files are read as one graph, one robot each.
+
+Examples:
+  magic posegraph solve runs/office/posegraph.g2o
   magic posegraph solve robot_0.g2o robot_1.g2o --robust gnc --out solved.g2o
 """
 
@@ -34,8 +37,10 @@ class SolveConfig:
 def main(arguments: list[str]) -> int:
     """Solve and print error before and after, time, and which loops were kept."""
     if arguments[:1] != ["solve"]:
-        print("usage: magic posegraph solve FILE... [options]", file=sys.stderr)
-        return 0 if arguments[:1] in (["-h"], ["--help"]) else 2
+        asked = arguments[:1] in (["-h"], ["--help"])
+        usage = f"usage: magic posegraph solve FILE... [options]\n\n{__doc__}"
+        print(usage, file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
     config = parse(
         SolveConfig, arguments[1:], prog="magic posegraph solve", description=__doc__ or ""
     )

@@ -89,3 +89,54 @@ def test_json_is_the_last_line_of_stdout(capsys, tmp_path):
     assert report["ok"] is False
     failed = [found["detail"] for found in report["findings"] if found["status"] == "fail"]
     assert any("empty" in detail for detail in failed)
+
+
+WITH_EXAMPLES = sorted(set(COMMANDS) - {"bench"})
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_help_is_short_enough_to_read_and_has_examples(name, capsys):
+    code = ended(run_command, [name, "--help"])
+    text = capsys.readouterr().out
+    assert code == 0
+    assert len(text.splitlines()) < 90
+    examples = [line.split("#")[0].strip() for line in text.splitlines() if "  magic " in line]
+    assert any(line.startswith(f"magic {name}") for line in examples)
+
+
+def test_all_settings_are_listed_on_demand(capsys):
+    assert ended(run_command, ["run", "--help"]) == 0
+    short = capsys.readouterr().out
+    assert "--tracking.*" in short
+    assert "--tracking.solver {" not in short
+    assert ended(run_command, ["run", "--help-all"]) == 0
+    assert "--tracking.solver {" in capsys.readouterr().out
+
+
+def test_a_live_camera_is_not_for_a_run_that_reads_twice(capsys):
+    assert run_command(["run", "realsense:"]) == 2
+    assert "magic agent realsense: --server" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["run", "serve", "agent"])
+def test_the_yaml_saved_beside_results_is_accepted_back(module, tmp_path):
+    import importlib
+
+    from magic_cli.options import parse
+    from magic_core.config import save_yaml
+
+    names = {"run": "RunConfig", "serve": "ServeCommand", "agent": "AgentCommand"}
+    cls = getattr(importlib.import_module(f"magic_cli.{module}"), names[module])
+    given = [] if module == "serve" else ["somewhere"]
+    first = parse(cls, given, prog=f"magic {module}", description="")
+    save_yaml(first, tmp_path / "config.yaml")
+    again = parse(cls, ["--config", str(tmp_path / "config.yaml")], prog="magic", description="")
+    assert again == first
+
+
+def ended(function, *arguments):
+    """The exit code, also of a command that ends the process."""
+    try:
+        return function(*arguments)
+    except SystemExit as end:
+        return end.code
