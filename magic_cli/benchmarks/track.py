@@ -3,17 +3,20 @@
 Runs the whole local SLAM of every agent once per solver, side by side on the same frames.
 `--ablations` compares each pose initialisation, pyramid depth and part of the tracker instead, as
 the paper's table. With several seeds every figure comes with its band: least, median, largest.
+`--faults` plays black frames, missing depth, exposure jumps and a kidnapped camera instead, and
+fails (exit status 1) where a pose is claimed that is not true.
 
 Examples:
   magic bench track DATASET --scale 0.5 --solvers gn,adam --frames 60
   magic bench track DATASET --solvers gn --seeds 0,1,2
   magic bench track DATASET --stride 3
   magic bench track DATASET --ablations --frames 100
+  magic bench track DATASET --faults
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import tyro
@@ -41,6 +44,8 @@ class TrackBenchmark:
     """Which solvers, joined by commas: gn, adam (the paper's, slow)."""
     ablations: bool = False
     """Print the ablation table instead of comparing solvers."""
+    faults: bool = False
+    """Play camera faults into the recording instead, with the default solver and the first seed."""
     seeds: str = "0"
     """Seeds, joined by commas; the table shows the band over them."""
     slam: Annotated[SlamConfig, tyro.conf.arg(name="")] = field(default_factory=SlamConfig)
@@ -52,6 +57,8 @@ class TrackBenchmark:
 def main(arguments: list[str]) -> int:
     """Run the benchmark and print its table."""
     config = parse(TrackBenchmark, arguments, prog="magic bench track", description=__doc__ or "")
+    if config.faults:
+        return _faults(config)
     from magic_agent.tracking import benchmark
 
     shared = {
@@ -76,6 +83,28 @@ def main(arguments: list[str]) -> int:
     if config.json:
         print_json(result)
     return 0
+
+
+def _faults(config: TrackBenchmark) -> int:
+    from magic_agent.tracking.faults import run_faults
+
+    result = run_faults(
+        config.dataset,
+        scale=config.scale,
+        config=replace(config.slam, seed=_seeds(config.seeds)[0]),
+        progress=lambda text: console.print(text, markup=False),
+    )
+    rows = [
+        [agent, name, found["outcome"], str(found["lost_frames"]), str(found["breaks"])]
+        + [f"{100 * found[figure]:.2f}" for figure in ("ate_rmse_m", "worst_m")]
+        for agent, reports in result["faults"].items()
+        for name, found in reports.items()
+    ]
+    columns = ["agent", "fault", "outcome", "lost", "breaks", "ATE cm", "worst cm"]
+    console.print(table("Camera faults", columns, rows))
+    if config.json:
+        print_json(result)
+    return 1 if result["wrong"] else 0
 
 
 def _seeds(text: str) -> list[int]:
