@@ -5,6 +5,9 @@ magic bench track DATASET                  accuracy and speed of tracking, solve
 magic bench map DATASET                    rendering of sub-maps, our schedule against the paper's
 magic bench agent DATASET --threads N      frames per second of one whole agent
 magic bench loops DATASET...               precision and recall of loop detection and verification
+magic bench merge RUN|DATASET              fine merging against the paper's scheme, and its memory
+magic bench codec DATASET                  bytes per sub-map, and what the compact codec costs
+magic bench ablations DATASET              the paper's tables with our rows, each part left out
 magic bench server                         many agents at once: rate, latencies, memory, event loop
 """
 
@@ -19,6 +22,9 @@ BENCHMARKS = {
     "map": "magic_cli.benchmarks.map",
     "agent": "magic_cli.benchmarks.agent",
     "loops": "magic_cli.benchmarks.loops",
+    "merge": "magic_cli.benchmarks.merge",
+    "codec": "magic_cli.benchmarks.codec",
+    "ablations": "magic_cli.benchmarks.ablations",
     "server": "magic_cli.benchmarks.server",
 }
 

@@ -1,23 +1,47 @@
-"""`magic export RUN --what map|trajectories|posegraph`: a run's results in other formats.
+"""`magic export RUN --what WHAT --out PATH`: a run's results in other tools' formats.
+
+  map           ply (standard 3DGS), compressed-ply (SuperSplat), spz, compact or lossless (ours)
+  mesh          ply or glb, fused from rendered depth and colour
+  points        ply: the Gaussians' means with normals and colours
+  trajectories  tum or kitti, one file per agent
+  posegraph     g2o
+
+`--axes` says what x, y and z of the file point to: (r)ight or (l)eft, (u)p or (d)own, (f)orward or
+(b)ack, of the first camera. Ours are rdf; ROS has flu, Unity ruf, glTF and SPZ want rub.
 
 Examples:
+  magic export runs/demo --what mesh --out scene.glb
+  magic export runs/demo --what map --out scene.ply --axes rub
   magic export runs/demo --what trajectories --format kitti --out kitti/
-  magic export runs/demo --what map --out scene.ply
 """
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from tyro.conf import Positional
 
 from magic_cli.options import parse
 from magic_cli.output import console, print_json
 from magic_core.errors import ConfigError, NotFound
 from magic_core.evaluation import RunFolder, write_kitti, write_tum
+from magic_core.gaussians import GaussianCloud
+from magic_core.geometry.axes import OURS, axes_from_ours
+from magic_server.globalmap import MeshConfig
+
+FORMATS = {
+    "map": ("ply", "compressed-ply", "spz", "compact", "lossless"),
+    "mesh": ("ply", "glb"),
+    "points": ("ply",),
+    "trajectories": ("tum", "kitti"),
+    "posegraph": ("g2o",),
+}
+_OF_SUFFIX = {".glb": "glb", ".spz": "spz"}
+_SPECIFIED_AXES = {"glb": "rub", "spz": "rub"}
+_DIRECTION = {"r": "right", "l": "left", "u": "up", "d": "down", "f": "forward", "b": "back"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,56 +51,145 @@ class ExportConfig:
     run: Positional[Path]
     """Run folder."""
     out: Path
-    """File (map, pose graph) or folder (trajectories) to write."""
-    what: Literal["map", "trajectories", "posegraph"] = "map"
+    """File to write; for trajectories a folder."""
+    what: Literal["map", "mesh", "points", "trajectories", "posegraph"] = "map"
     """What to write."""
-    format: Literal["ply", "tum", "kitti", "g2o"] | None = None
-    """map: ply (standard 3DGS). trajectories: tum (default) or kitti. posegraph: g2o."""
+    format: (
+        Literal["ply", "compressed-ply", "spz", "compact", "lossless", "glb", "tum", "kitti", "g2o"]
+        | None
+    ) = None
+    """Default: what the file's suffix says, else the first of those listed above."""
+    axes: str | None = None
+    """Axes of the file, such as rdf, rub, flu or ruf; default rdf, but rub for glb and spz, whose
+    specifications say so."""
     kind: Literal["tracked", "corrected", "ground_truth"] = "corrected"
     """Which trajectories: odometry alone, after the pose graph, or the data's own."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the mesh is made."""
     json: bool = False
     """Print one JSON object as the last line."""
-
-
-FORMATS = {"map": ("ply",), "trajectories": ("tum", "kitti"), "posegraph": ("g2o",)}
 
 
 def main(arguments: list[str]) -> int:
     """Write the chosen files and list them."""
     config = parse(ExportConfig, arguments, prog="magic export", description=__doc__ or "")
-    chosen = config.format or FORMATS[config.what][0]
-    if chosen not in FORMATS[config.what]:
-        choices = ", ".join(FORMATS[config.what])
-        raise ConfigError(f"--format {chosen}: {config.what} can be written as {choices}")
+    chosen = _chosen_format(config)
+    axes = (config.axes or _SPECIFIED_AXES.get(chosen, OURS)).lower()
+    matrix = axes_from_ours(axes)
     folder = RunFolder(config.run)
-    if config.what == "trajectories":
-        written = _trajectories(folder, config, chosen)
-    else:
-        source = folder.map_path if config.what == "map" else folder.posegraph_path
-        written = [_copy(source, config.out)]
+    if config.what != "trajectories":
+        config.out.parent.mkdir(parents=True, exist_ok=True)
+    write = {
+        "map": _map,
+        "mesh": _mesh,
+        "points": _points,
+        "trajectories": _trajectories,
+        "posegraph": _posegraph,
+    }[config.what]
+    written = write(folder, config, chosen, matrix)
     for path in written:
-        console.print(f"Written: {path}", soft_wrap=True)
+        console.print(f"Written: {path} ({chosen}, axes {named_axes(axes)})", soft_wrap=True)
     if config.json:
-        print_json({"written": [str(path) for path in written]})
+        print_json({"written": [str(path) for path in written], "format": chosen, "axes": axes})
     return 0
 
 
-def _trajectories(folder: RunFolder, config: ExportConfig, chosen: str) -> list[Path]:
+def named_axes(axes: str) -> str:
+    """`x right, y down, z forward` of `rdf`."""
+    return ", ".join(
+        f"{name} {_DIRECTION[letter]}" for name, letter in zip("xyz", axes, strict=True)
+    )
+
+
+def _chosen_format(config: ExportConfig) -> str:
+    possible = FORMATS[config.what]
+    by_suffix = _OF_SUFFIX.get(config.out.suffix.lower(), possible[0])
+    chosen: str = config.format or (by_suffix if by_suffix in possible else possible[0])
+    if chosen not in possible:
+        choices = ", ".join(possible)
+        raise ConfigError(f"--format {chosen}: {config.what} can be written as {choices}")
+    return chosen
+
+
+def _map(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
+    cloud = _oriented_map(folder, matrix)
+    if chosen == "ply":
+        from magic_core.gaussians.ply import write_ply
+
+        axes = named_axes(config.axes or OURS)
+        return [write_ply(config.out, cloud, axes=f"{axes} of the first camera")]
+    if chosen in ("compressed-ply", "spz"):
+        from magic_core.gaussians.splats import write_splats
+
+        return [write_splats(config.out, cloud, chosen)]
+    from magic_core.gaussians import codec
+
+    encode = codec.encode_compact if chosen == "compact" else codec.encode_lossless
+    config.out.write_bytes(encode(cloud))
+    return [config.out]
+
+
+def _oriented_map(folder: RunFolder, matrix: np.ndarray) -> GaussianCloud:
+    cloud = folder.read_map()
+    return cloud if np.array_equal(matrix, np.eye(3)) else cloud.reoriented(matrix)
+
+
+def _points(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
+    from magic_core.gaussians.points import write_points
+
+    cloud = _oriented_map(folder, matrix)
+    comment = f"axes {named_axes(config.axes or OURS)} of the first camera"
+    return [write_points(config.out, cloud.select(cloud.opacities >= 0.5), comment=comment)]
+
+
+def _mesh(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
+    from magic_core.evaluation.accuracy import main_component_trajectories
+    from magic_server.globalmap.mesh import mesh_of
+    from magic_server.globalmap.mesh_file import write_mesh
+
+    trajectories = main_component_trajectories(folder)
+    if not trajectories:
+        raise NotFound(f"{folder.path}: no corrected trajectory; is this a finished run?")
+    camera = folder.read_agent_report(next(iter(trajectories))).camera
+    poses = np.concatenate([t.world_from_camera for t in trajectories.values()])
+    cloud = folder.read_map()
+    with console.status("fusing rendered depth") as status:
+        mesh = mesh_of(
+            cloud, camera, poses, config.mesh,
+            progress=lambda share: status.update(f"fusing rendered depth: {share:.0%}"),
+        )  # fmt: skip
+    return [write_mesh(config.out, mesh.reoriented(matrix), "glb" if chosen == "glb" else "ply")]
+
+
+def _trajectories(
+    folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray
+) -> list[Path]:
     written = []
     for agent in folder.agents():
         if folder.has_trajectory(agent, config.kind):
             config.out.mkdir(parents=True, exist_ok=True)
             path = config.out / f"{agent}.txt"
             write = write_kitti if chosen == "kitti" else write_tum
-            write(path, folder.read_trajectory(agent, config.kind))
+            write(path, folder.read_trajectory(agent, config.kind).reoriented(matrix))
             written.append(path)
     if not written:
         raise NotFound(f"{folder.path}: no {config.kind} trajectory; is this a finished run?")
     return written
 
 
-def _copy(source: Path, target: Path) -> Path:
-    if not source.is_file():
-        raise NotFound(f"{source}: not in this run folder; did the run finish?")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    return Path(shutil.copyfile(source, target))
+def _posegraph(
+    folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray
+) -> list[Path]:
+    from magic_core.geometry.axes import reoriented_information, reoriented_poses
+    from magic_server.posegraph.g2o import read_g2o, write_g2o
+
+    if not folder.posegraph_path.is_file():
+        raise NotFound(f"{folder.posegraph_path}: not in this run folder; did the run finish?")
+    graph = read_g2o([folder.posegraph_path])
+    poses = {key: reoriented_poses(pose, matrix) for key, pose in graph.poses.items()}
+    edges = [
+        (i, j, reoriented_poses(motion, matrix), reoriented_information(information, matrix))
+        for i, j, motion, information in graph.edges
+    ]
+    write_g2o(config.out, poses, edges)
+    return [config.out]

@@ -25,6 +25,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("magic_cli.export", "write a run's map or trajectories in other formats"),
     "tracking": ("magic_cli.tracking", "how tracking went: cost, inliers, lost frames, per frame"),
     "loops": ("magic_cli.loops", "every loop candidate of a run, and why it was believed or not"),
+    "render": ("magic_cli.render", "new views of a run's map, as a video or pictures"),
     "posegraph": (
         "magic_cli.posegraph",
         "`posegraph solve FILE...`: solve pose graphs in g2o files",

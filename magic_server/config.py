@@ -16,6 +16,7 @@ from magic_server.jobs import JobConfig
 from magic_server.localize_config import LocalizeConfig
 from magic_server.loops import LoopConfig
 from magic_server.posegraph import PoseGraphConfig
+from magic_server.preview_config import PreviewConfig
 from magic_server.probes import MetricsConfig
 from magic_server.quotas import QuotaConfig
 from magic_server.registration import RegistrationConfig
@@ -97,6 +98,7 @@ class ServerConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     posegraph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
+    preview: PreviewConfig = field(default_factory=PreviewConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:

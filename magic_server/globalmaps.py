@@ -6,7 +6,6 @@ import asyncio
 import dataclasses
 import logging
 import shutil
-import tempfile
 import time
 from concurrent.futures import Executor
 from pathlib import Path
@@ -59,12 +58,16 @@ class GlobalMaps:
         self._under_way: dict[int, set[asyncio.Task[None]]] = {}
         self._changed = asyncio.Event()
         self._stopping = False
+        self._closing = False
 
     async def start(self) -> None:
-        """Begin again with every operation that a stopped server left open."""
+        """Go on with every operation that a stopped server left open."""
+        unfinished = await self._store.maps.unfinished()
+        open_folders = {self._folder_of(operation.id) for operation in unfinished}
         for leftover in self._store.folder.glob(f"{_MERGE_PREFIX}*"):
-            await self._in_thread(shutil.rmtree, leftover, True)
-        for operation in await self._store.maps.unfinished():
+            if leftover not in open_folders:
+                await self._in_thread(shutil.rmtree, leftover, True)
+        for operation in unfinished:
             session = await self._store.agents.session(operation.session)
             self._begin(operation.id, session, operation.request)
 
@@ -74,7 +77,8 @@ class GlobalMaps:
         self._notify()
 
     async def close(self) -> None:
-        """Stop; operations under way begin again after the next start."""
+        """Stop; operations under way go on after the next start."""
+        self._closing = True
         await self._tasks.close()
 
     async def forget(self, session: SessionRow) -> None:
@@ -149,8 +153,8 @@ class GlobalMaps:
             logger.warning("%s: merging with loops still open", session.name)
         snapshot = coordinator.board.snapshot
         chosen = chosen_poses(snapshot, request.component)
-        root = self._store.folder
-        folder = Path(await self._in_thread(tempfile.mkdtemp, None, _MERGE_PREFIX, root))
+        folder = self._folder_of(operation)
+        await self._in_thread(lambda: folder.mkdir(exist_ok=True))
         try:
             try:
                 task = await self._task(coordinator, chosen, request, folder)
@@ -160,7 +164,11 @@ class GlobalMaps:
                 raise
             await self._keep(operation, session, snapshot.revision, chosen, outcome)
         finally:
-            await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
+            if not self._closing:  # a server that stops keeps what it has, to go on from there
+                await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
+
+    def _folder_of(self, operation: int) -> Path:
+        return self._store.folder / f"{_MERGE_PREFIX}{operation}"
 
     async def _task(
         self,

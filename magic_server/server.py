@@ -35,6 +35,7 @@ from magic_server.jobs import ProcessExecutor
 from magic_server.localizing import Localizer
 from magic_server.metrics import Metrics
 from magic_server.native_log import NativeLog
+from magic_server.preview import Previews
 from magic_server.probes import ProbePort
 from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
@@ -84,6 +85,13 @@ class Server:
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
         self.sessions = Sessions(self._store, metrics=self.metrics, **shared)
         self._maps = GlobalMaps(self._store, self.sessions, **shared)
+        self._previews = Previews(
+            self._store,
+            self.sessions,
+            jobs=self._jobs,
+            threads=self._threads,
+            config=config.preview,
+        )
         self.localizer = Localizer(self._store, **shared)
         self._health = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
         self._grpc: grpc.aio.Server | None = None
@@ -143,6 +151,7 @@ class Server:
             await self.sessions.start()
             await self._maps.start()
             self._upkeep.start()
+            await self._previews.start()
             self.gate.open()
             await self._set_ready(True)
         except BaseException:
@@ -173,6 +182,7 @@ class Server:
         await self._upkeep.close()
         await self._receiver.close()
         await self._maps.close()
+        await self._previews.close()
         await self.sessions.close()
         await self._jobs.close()
         await self._store.close()
@@ -245,7 +255,7 @@ class Server:
             config=self.config,
         )
         mapping_grpc.add_MappingServiceServicer_to_server(mapping, server)
-        maps = GlobalMapServicer(self._store, self._maps, threads=self._threads)
+        maps = GlobalMapServicer(self._store, self._maps, self._previews, threads=self._threads)
         map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
         sessions = SessionServicer(
             self._store,

@@ -66,6 +66,10 @@ class Sessions:
         for coordinator in self._coordinators.values():
             await coordinator.close()
 
+    def live(self) -> list[SessionCoordinator]:
+        """The coordinators of all sessions."""
+        return list(self._coordinators.values())
+
     async def coordinator(self, session: SessionRow) -> SessionCoordinator:
         """A session's coordinator; the session must be in the store."""
         async with self._lock:

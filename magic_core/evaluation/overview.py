@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magic_core.evaluation import vantage
 from magic_core.evaluation.charts import colour_of
 from magic_core.evaluation.trajectory import Trajectory
-from magic_core.evaluation.views import ComparedView, Renders
+from magic_core.evaluation.views import ComparedView, Renders, View
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
 
@@ -63,20 +63,41 @@ def outside_picture(
     rasteriser: Renders,
 ) -> NDArray[np.uint8]:
     """(h, w, 3) the map seen from above at an angle, walls between it and the viewer left out."""
+    scene = scene_of(cloud, camera, trajectories, rasteriser)
+    outside = vantage.outside_camera(_WIDTH, _HEIGHT)
+    pose = vantage.best_outside_pose(scene, outside, rasteriser)
+    picture = cut_open(scene, outside, pose, rasteriser)
+    for number, agent in enumerate(sorted(trajectories)):
+        _draw_track(picture, outside, pose, trajectories[agent], colour_of(number, on_dark=True))
+    return picture
+
+
+def scene_of(
+    cloud: GaussianCloud,
+    camera: Camera,
+    trajectories: Mapping[str, Trajectory],
+    rasteriser: Renders,
+) -> vantage.Scene:
+    """The map with what its cameras saw of it, ready to be looked at from outside."""
     frame = vantage.plan_frame(list(trajectories.values()))
     poses = np.concatenate([t.world_from_camera for t in trajectories.values()])
     watchers = poses[np.linspace(0, len(poses) - 1, min(_OBSERVERS, len(poses))).astype(int)]
     seen = vantage.seen_surface(cloud, camera, watchers, rasteriser)
-    outside = vantage.outside_camera(_WIDTH, _HEIGHT)
-    scene = vantage.Scene(cloud, seen, frame, poses[:, :3, 3])
-    pose = vantage.best_outside_pose(scene, outside, rasteriser)
-    shown = cloud.select(vantage.facing(cloud, seen, pose[:3, 3]))
-    view = rasteriser.render(shown, outside, pose)
+    return vantage.Scene(cloud, seen, frame, poses[:, :3, 3])
+
+
+def cut_open(
+    scene: vantage.Scene, camera: Camera, pose: NDArray[np.float64], rasteriser: Renders
+) -> NDArray[np.uint8]:
+    """(h, w, 3) a scene from outside, on a dark ground, walls that face away left out."""
+    shown = scene.cloud.select(vantage.facing(scene.cloud, scene.seen, pose[:3, 3]))
+    return on_ground(rasteriser.render(shown, camera, pose))
+
+
+def on_ground(view: View) -> NDArray[np.uint8]:
+    """(h, w, 3) a rendered view on a dark ground."""
     image = 255.0 * view.colour + (1.0 - view.alpha[..., None]) * _GROUND
-    picture = np.ascontiguousarray(np.clip(np.rint(image), 0, 255), np.uint8)
-    for number, agent in enumerate(sorted(trajectories)):
-        _draw_track(picture, outside, pose, trajectories[agent], colour_of(number, on_dark=True))
-    return picture
+    return np.ascontiguousarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
 def _draw_track(

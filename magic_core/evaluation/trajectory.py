@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magic_core.errors import CorruptData, InvalidInput
 from magic_core.geometry import se3
+from magic_core.geometry.axes import reoriented_poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,10 @@ class Trajectory:
     def transformed(self, target_from_world: ArrayLike) -> Trajectory:
         """The same motion in another frame."""
         return Trajectory(self.timestamps_s, np.asarray(target_from_world) @ self.world_from_camera)
+
+    def reoriented(self, matrix: ArrayLike) -> Trajectory:
+        """The same motion with other axes (3, 3) of both the world and the camera."""
+        return Trajectory(self.timestamps_s, reoriented_poses(self.world_from_camera, matrix))
 
     def select(self, index: NDArray) -> Trajectory:
         """The poses of a boolean mask (n,) or an index array."""

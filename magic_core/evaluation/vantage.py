@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _ELEVATION_RAD = np.deg2rad(56.0)
 _FIELD_OF_VIEW_RAD = np.deg2rad(36.0)
 _MARGIN = 1.04
+_ORBIT_MARGIN = 1.12  # one centre for all azimuths leaves each a little off its own
 _SKETCH_POINTS = 40_000
 _OWN_UP_WEIGHT = 0.004  # what a few degrees of roll spread the horizontal axes vertically
 
@@ -149,6 +150,29 @@ def outside_pose(scene: Scene, camera: Camera, *, azimuth_rad: float) -> Array:
         fill = float((0.5 * (high - low) / half).max())
         distance += depth * (_MARGIN * fill - 1.0)
     return se3.from_rotation_translation(rotation, centre - distance * rotation[:, 2])
+
+
+def orbit_poses(scene: Scene, camera: Camera, *, count: int) -> Array:
+    """(count, 4, 4) poses once round the map, at one height, all looking at one centre.
+
+    As far away as the azimuth that needs most distance asks for, so that nothing pumps.
+    """
+    sketch = scene.thinned(_SKETCH_POINTS)
+    tried = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    outside = np.stack([outside_pose(sketch, camera, azimuth_rad=float(a)) for a in tried])
+    # The point that all these views look at, in the sense of least squares.
+    across = np.eye(3) - outside[:, :3, 2, None] * outside[:, None, :3, 2]
+    centre = np.linalg.solve(across.sum(axis=0), (across @ outside[:, :3, 3, None]).sum(axis=0))
+    centre = centre[:, 0]
+    distance = _ORBIT_MARGIN * float(np.linalg.norm(outside[:, :3, 3] - centre, axis=1).max())
+    horizontal, height = np.cos(_ELEVATION_RAD), np.sin(_ELEVATION_RAD)
+    poses = []
+    for azimuth in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        away = np.array([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), height])
+        rotation = scene.frame.axes.T @ _looking_along(-away)
+        position = centre - distance * rotation[:, 2]
+        poses.append(se3.from_rotation_translation(rotation, position))
+    return np.stack(poses)
 
 
 def _bounds(

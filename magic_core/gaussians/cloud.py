@@ -73,6 +73,23 @@ class GaussianCloud:
             colours=self.colours,
         )
 
+    def reoriented(self, matrix: ArrayLike) -> GaussianCloud:
+        """This cloud in other axes: `matrix` (3, 3) is orthogonal, a rotation or a mirror."""
+        from scipy.spatial.transform import Rotation
+
+        matrix = np.asarray(matrix, dtype=np.float64)
+        # A Gaussian is symmetric: turning one of its own axes round changes nothing, and makes a
+        # mirrored rotation a rotation again.
+        own = np.diag([1.0, 1.0, np.linalg.det(matrix)])
+        rotations = matrix @ se3.rotation_from_quaternion(self.quaternions) @ own
+        return GaussianCloud.from_arrays(
+            self.means @ matrix.T,
+            Rotation.from_matrix(rotations).as_quat(scalar_first=True),
+            scales=self.scales,
+            opacities=self.opacities,
+            colours=self.colours,
+        )
+
     def validate(self, field: str = "gaussians") -> None:
         """Raise InvalidInput with every rule that is broken (shapes, finite, unit, ranges)."""
         found = [FieldViolation(f"{field}.{name}", text) for name, text in self._violations()]

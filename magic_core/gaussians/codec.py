@@ -26,8 +26,10 @@ MAX_GAUSSIANS = 50_000_000
 
 _HEADER = struct.Struct("<4sBBHI")  # magic, version, layout, reserved, count
 _RANGES = struct.Struct("<3dd2f2f")  # origin xyz, step, log-scale range, colour range
-_LOSSLESS_BYTES, _COMPACT_BYTES = 56, 23
-_LOSSLESS_COLUMNS = (3, 4, 3, 1, 3)
+LOSSLESS_BYTES, COMPACT_BYTES = 56, 23  # per Gaussian
+HEADER_BYTES, RANGES_BYTES = _HEADER.size, _RANGES.size
+LOSSLESS_COLUMNS = (3, 4, 3, 1, 3)
+MAX_GRID = 2**BITS - 1
 _QUATERNION_LEVELS = 1023
 _SQRT_HALF = 0.5**0.5
 
@@ -42,37 +44,82 @@ class CompactOptions:
     """1 (fast) to 19 (small)."""
 
 
+DEFAULT_COMPACT = CompactOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Where positions snap to."""
+
+    origin: NDArray[np.float64]  # (3,) metres
+    step: float
+    """Metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompactCodes:
+    """A cloud in the codes of the compact layout."""
+
+    columns: list[NDArray[np.uint8]]
+    """23 columns of n bytes, in the layout's order."""
+    last: NDArray[np.int64]
+    """(1, 3) grid coordinates of the last Gaussian, from which a next piece goes on."""
+
+
 def encode_lossless(cloud: GaussianCloud, *, zstd_level: int = 3) -> bytes:
     """All five columns as float32, in order; decodes bit for bit."""
     columns = b"".join(array.astype("<f4").tobytes() for array in cloud.arrays())
     return _pack(LOSSLESS, len(cloud), columns, zstd_level)
 
 
-def encode_compact(cloud: GaussianCloud, options: CompactOptions = CompactOptions()) -> bytes:
+def encode_compact(cloud: GaussianCloud, options: CompactOptions = DEFAULT_COMPACT) -> bytes:
     """Quantised columns in Morton order; about a quarter of the lossless size.
 
     Positions are off by at most half a step per axis, scales by at most 2 % over a range of
     1:10,000, rotations by at most 0.25 degrees, opacities by 1/512, colours by 1/510 of their
     range. Positions that do not fit 2^21 steps per axis get a coarser step.
     """
-    grid, origin, step = _position_grid(cloud.means, options.position_step_m)
-    order = np.argsort(morton_codes(grid), kind="stable")
-    grid, cloud = grid[order], cloud.select(order)
-    log_scales = np.log(np.maximum(cloud.scales.astype(np.float64), 1e-12))
-    scale_range = _range(log_scales, 0.0, 0.0)
-    colour_range = _range(cloud.colours, 0.0, 1.0)
-    opacity = np.clip(cloud.opacities.astype(np.float64) * 256.0, 0.0, 255.0).astype(np.uint8)
-    payload = b"".join(
-        [
-            _RANGES.pack(*origin, step, *scale_range, *colour_range),
-            _planes(_zigzag(np.diff(grid, axis=0, prepend=0)).T),
-            _planes(_quaternion_codes(cloud.quaternions)),
-            _to_bytes(log_scales, scale_range).T.tobytes(),
-            opacity.tobytes(),
-            _to_bytes(cloud.colours, colour_range).T.tobytes(),
-        ]
-    )
+    grid = _position_grid(cloud.means, options.position_step_m)
+    log_scale = _range(_log_scales(cloud), 0.0, 0.0)
+    colour = _range(cloud.colours, 0.0, 1.0)
+    codes = compact_codes(cloud, grid, log_scale, colour, after=np.zeros((1, 3), np.int64))
+    ranges = pack_ranges(grid, log_scale, colour)
+    payload = b"".join([ranges, *(column.tobytes() for column in codes.columns)])
     return _pack(COMPACT, len(cloud), payload, options.zstd_level)
+
+
+def pack_ranges(grid: Grid, log_scale: tuple[float, float], colour: tuple[float, float]) -> bytes:
+    """The 48 bytes that say what the compact codes mean."""
+    return _RANGES.pack(*grid.origin, grid.step, *log_scale, *colour)
+
+
+def compact_codes(
+    cloud: GaussianCloud,
+    grid: Grid,
+    log_scale: tuple[float, float],
+    colour: tuple[float, float],
+    *,
+    after: NDArray[np.int64],
+) -> CompactCodes:
+    """A cloud in Morton order as columns of bytes; its first position is coded from `after`."""
+    places = np.rint((cloud.means.astype(np.float64) - grid.origin) / grid.step).astype(np.int64)
+    order = np.argsort(morton_codes(places), kind="stable")
+    places, cloud = places[order], cloud.select(order)
+    deltas = _zigzag(np.diff(places, axis=0, prepend=after))
+    opacity = np.clip(cloud.opacities.astype(np.float64) * 256.0, 0.0, 255.0).astype(np.uint8)
+    n = len(cloud)
+    columns = [
+        *np.frombuffer(_planes(deltas.T), np.uint8).reshape(12, n),
+        *np.frombuffer(_planes(_quaternion_codes(cloud.quaternions)), np.uint8).reshape(4, n),
+        *_to_bytes(_log_scales(cloud), log_scale).T,
+        opacity,
+        *_to_bytes(cloud.colours, colour).T,
+    ]
+    return CompactCodes(columns, places[-1:] if n else after)
+
+
+def _log_scales(cloud: GaussianCloud) -> NDArray[np.float64]:
+    return np.log(np.maximum(cloud.scales.astype(np.float64), 1e-12))
 
 
 def decode(data: bytes, *, max_gaussians: int = MAX_GAUSSIANS) -> GaussianCloud:
@@ -85,9 +132,9 @@ def decode(data: bytes, *, max_gaussians: int = MAX_GAUSSIANS) -> GaussianCloud:
     layout, count = _read_header(data)
     if count > max_gaussians:
         raise ResourceExhausted(f"{count} Gaussians in one blob, at most {max_gaussians} allowed")
-    size = count * _LOSSLESS_BYTES
+    size = count * LOSSLESS_BYTES
     if layout == COMPACT:
-        size = _RANGES.size + count * _COMPACT_BYTES
+        size = _RANGES.size + count * COMPACT_BYTES
     payload = _unpack(data, size)
     cloud = (_decode_lossless if layout == LOSSLESS else _decode_compact)(payload, count)
     with np.errstate(over="ignore"):  # the norm of a damaged quaternion
@@ -115,11 +162,15 @@ def _read_header(data: bytes) -> tuple[int, int]:
     return layout, count
 
 
-def _pack(layout: int, count: int, payload: bytes, level: int) -> bytes:
+def header(layout: int, count: int) -> bytes:
+    """The 12 bytes before the zstd frame; InvalidInput when there are too many Gaussians."""
     if count > MAX_GAUSSIANS:
         raise InvalidInput(f"{count} Gaussians in one blob, at most {MAX_GAUSSIANS} allowed")
-    header = _HEADER.pack(MAGIC, VERSION, layout, 0, count)
-    return header + zstandard.ZstdCompressor(level=level).compress(payload)
+    return _HEADER.pack(MAGIC, VERSION, layout, 0, count)
+
+
+def _pack(layout: int, count: int, payload: bytes, level: int) -> bytes:
+    return header(layout, count) + zstandard.ZstdCompressor(level=level).compress(payload)
 
 
 def _unpack(data: bytes, size: int) -> bytes:
@@ -140,9 +191,9 @@ def _unpack(data: bytes, size: int) -> bytes:
 
 def _decode_lossless(payload: bytes, count: int) -> GaussianCloud:
     flat = np.frombuffer(payload, "<f4").astype(np.float32)
-    ends = np.cumsum([0, *(count * width for width in _LOSSLESS_COLUMNS)])
+    ends = np.cumsum([0, *(count * width for width in LOSSLESS_COLUMNS)])
     parts = [flat[a:b] for a, b in itertools.pairwise(ends)]
-    shapes = [count if width == 1 else (count, width) for width in _LOSSLESS_COLUMNS]
+    shapes = [count if width == 1 else (count, width) for width in LOSSLESS_COLUMNS]
     return GaussianCloud(*(p.reshape(shape) for p, shape in zip(parts, shapes, strict=True)))
 
 
@@ -167,14 +218,12 @@ def _decode_compact(payload: bytes, count: int) -> GaussianCloud:
         )
 
 
-def _position_grid(means: NDArray[np.float32], step: float) -> tuple[NDArray, NDArray, float]:
-    """Integer positions (n, 3), their origin (3,) and step in metres."""
+def _position_grid(means: NDArray[np.float32], step: float) -> Grid:
     if len(means) == 0:
-        return np.zeros((0, 3), np.int64), np.zeros(3), step
+        return Grid(np.zeros(3), step)
     points = means.astype(np.float64)
     origin = points.min(axis=0)
-    step = max(step, float((points.max(axis=0) - origin).max()) / (2**BITS - 1))
-    return np.rint((points - origin) / step).astype(np.int64), origin, step
+    return Grid(origin, max(step, float((points.max(axis=0) - origin).max()) / MAX_GRID))
 
 
 def _zigzag(values: NDArray) -> NDArray[np.uint32]:

@@ -20,6 +20,7 @@ from magic_core.gaussians.cloud import GaussianCloud
 SH_DEGREE_0 = 0.5 / np.sqrt(np.pi)
 """The constant spherical harmonic Y_00: colour = 0.5 + SH_DEGREE_0 * f_dc."""
 
+OUR_AXES = "x right, y down, z forward of the first camera"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -30,17 +31,16 @@ _MIN_OPACITY = 1e-6
 _MIN_SCALE_M = 1e-9
 
 
-def write_ply(path: Path | str, cloud: GaussianCloud, *, comment: str = "") -> Path:
-    """Write a cloud; the file is replaced in one step, never left half written."""
+def write_ply(
+    path: Path | str, cloud: GaussianCloud, *, comment: str = "", axes: str = OUR_AXES
+) -> Path:
+    """Write a cloud; the file is replaced in one step, never left half written.
+
+    `axes` is what the file says of the cloud's axes.
+    """
     path = Path(path)
-    vertices = np.zeros(len(cloud), dtype=[(name, "<f4") for name in _FIELDS])
-    _put(vertices, _POSITION, cloud.means)
-    _put(vertices, _COLOUR, (cloud.colours - 0.5) / np.float32(SH_DEGREE_0))
-    opacities = np.clip(cloud.opacities.astype(np.float64), _MIN_OPACITY, 1.0 - _MIN_OPACITY)
-    vertices["opacity"] = np.log(opacities / (1.0 - opacities))
-    _put(vertices, _SCALE, np.log(np.maximum(cloud.scales, _MIN_SCALE_M)))
-    _put(vertices, _ROTATION, cloud.quaternions)
-    comments = ["metres; axes x right, y down, z forward of the first camera"]
+    vertices = rows(cloud)
+    comments = [f"metres; axes {axes}"]
     comments += [comment] if comment else []
     data = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -50,6 +50,25 @@ def write_ply(path: Path | str, cloud: GaussianCloud, *, comment: str = "") -> P
     finally:
         partial.unlink(missing_ok=True)
     return path
+
+
+def rows(cloud: GaussianCloud) -> NDArray:
+    """The vertices of a cloud, one structured row per Gaussian."""
+    vertices = np.zeros(len(cloud), dtype=[(name, "<f4") for name in _FIELDS])
+    _put(vertices, _POSITION, cloud.means)
+    _put(vertices, _COLOUR, (cloud.colours - 0.5) / np.float32(SH_DEGREE_0))
+    opacities = np.clip(cloud.opacities.astype(np.float64), _MIN_OPACITY, 1.0 - _MIN_OPACITY)
+    vertices["opacity"] = np.log(opacities / (1.0 - opacities))
+    _put(vertices, _SCALE, np.log(np.maximum(cloud.scales, _MIN_SCALE_M)))
+    _put(vertices, _ROTATION, cloud.quaternions)
+    return vertices
+
+
+def header(count: int, *, axes: str = OUR_AXES) -> bytes:
+    """The text before `count` rows."""
+    lines = ["ply", "format binary_little_endian 1.0", f"comment metres; axes {axes}"]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in _FIELDS)]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()
 
 
 def read_ply(path: Path | str) -> GaussianCloud:

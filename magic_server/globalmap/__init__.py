@@ -6,13 +6,13 @@ reading a config or showing help stays quick.
 
 from typing import TYPE_CHECKING, Any
 
-from magic_server.globalmap.config import MergeConfig
+from magic_server.globalmap.config import MergeConfig, MeshConfig
 from magic_server.globalmap.placement import PlacedSubmap
 
 if TYPE_CHECKING:
     from magic_server.globalmap.merge import GlobalMap, build_global_map
 
-__all__ = ["GlobalMap", "MergeConfig", "PlacedSubmap", "build_global_map"]
+__all__ = ["GlobalMap", "MergeConfig", "MeshConfig", "PlacedSubmap", "build_global_map"]
 
 
 def __getattr__(name: str) -> Any:

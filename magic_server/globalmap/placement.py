@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,53 @@ from magic_core.submap import Submap
 Pose = NDArray[np.float64]
 
 
+class PlacedSource(Protocol):
+    """A sub-map and where the pose graph put it; its parts are read when they are asked for.
+
+    A merge holds what one block needs and asks again for the next: a map may be larger than memory.
+    """
+
+    @property
+    def world_from_anchor(self) -> Pose: ...
+    @property
+    def camera(self) -> Camera: ...
+    def gaussians(self) -> GaussianCloud:
+        """The Gaussians, in the anchor frame."""
+        ...
+
+    def keyframe_poses(self) -> list[Pose]:
+        """anchor_from_camera (4, 4) of every keyframe."""
+        ...
+
+    def images(self, keyframe: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour (h, w, 3) and depth (h, w) in metres of one keyframe."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class PlacedSubmap:
-    """A sub-map and where the pose graph put its anchor."""
+    """A sub-map in memory and where the pose graph put its anchor."""
 
     submap: Submap
     world_from_anchor: Pose  # (4, 4)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all its keyframes."""
+        return self.submap.camera
+
+    def gaussians(self) -> GaussianCloud:
+        """The Gaussians, in the anchor frame."""
+        return self.submap.gaussians
+
+    def keyframe_poses(self) -> list[Pose]:
+        """anchor_from_camera (4, 4) of every keyframe."""
+        return [keyframe.anchor_from_camera for keyframe in self.submap.keyframes]
+
+    def images(self, keyframe: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Colour (h, w, 3) and depth (h, w) in metres of one keyframe."""
+        chosen = self.submap.keyframes[keyframe]
+        return chosen.colour, chosen.depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,26 +76,31 @@ class View:
     depth: NDArray[np.float32]  # (h, w) metres, 0 = no reading
 
 
-def coarse_merge(submaps: Sequence[PlacedSubmap]) -> GaussianCloud:
+def placed_gaussians(source: PlacedSource) -> GaussianCloud:
+    """A sub-map's Gaussians in the world frame."""
+    return source.gaussians().transformed(source.world_from_anchor)
+
+
+def coarse_merge(sources: Sequence[PlacedSource]) -> GaussianCloud:
     """All Gaussians in the world frame, appended (the paper's coarse stage), in Morton order.
 
     Agents send each Gaussian once, so no intersection check is needed.
     """
-    appended = GaussianCloud.concatenate(
-        [placed.submap.gaussians.transformed(placed.world_from_anchor) for placed in submaps]
+    return in_morton_order(
+        GaussianCloud.concatenate([placed_gaussians(source) for source in sources])
     )
-    return in_morton_order(appended)
 
 
-def views_of(submaps: Sequence[PlacedSubmap]) -> list[View]:
+def view_of(source: PlacedSource, keyframe: int) -> View:
+    """One keyframe, in the world frame."""
+    pose = source.world_from_anchor @ source.keyframe_poses()[keyframe]
+    return View(source.camera, pose, *source.images(keyframe))
+
+
+def views_of(sources: Sequence[PlacedSource]) -> list[View]:
     """Every keyframe of every sub-map, in the world frame."""
     return [
-        View(
-            placed.submap.camera,
-            placed.world_from_anchor @ keyframe.anchor_from_camera,
-            keyframe.colour,
-            keyframe.depth,
-        )
-        for placed in submaps
-        for keyframe in placed.submap.keyframes
+        view_of(source, keyframe)
+        for source in sources
+        for keyframe in range(len(source.keyframe_poses()))
     ]

@@ -1,30 +1,40 @@
-"""The fine stage: fill what is missing, optimise from the keyframes, drop what is superfluous.
+"""The fine stage: drop duplicates, fill what is missing, optimise from the keyframes.
 
 Paper, "Global Map Construction": the mapping losses again, over all sub-maps' keyframes, and
-pruning. The paper takes 3,000 steps on keyframes at random; here keyframes take turns by the space
-they see, duplicates of overlapping sub-maps go half way, and it can end once the loss settles.
+pruning. The paper takes 3,000 steps on keyframes at random; here duplicates of overlapping sub-maps
+go first, keyframes take turns by the space they see, learning rates begin high and fall, and it
+ends once the keyframes' losses fall no further.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from magic_core.gaussians import GaussianCloud
 from magic_core.render import GaussianOptimiser, LearningRates, Rasteriser
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.contribution import best_contribution
+from magic_server.globalmap.exposure import ExposureModel
 from magic_server.globalmap.fill import fill_measured, fill_unmeasured
 from magic_server.globalmap.placement import View
 from magic_server.globalmap.sampling import VisitOrder, region_weights
 
 Progress = Callable[[float, str], None]
+Checkpoint = Callable[[GaussianCloud, int], None]
 
 _MIN_STEPS_PER_PASS = 60
-_DEDUPLICATE_AT = 0.5  # share of the budget after which duplicates go, unless the loss settled
-_HIDDEN_SHARE = 0.1  # of min_contribution: what appended sub-maps lose before any optimisation
+_SETTLED_PASSES = 2  # so many passes in a row must gain little
+_CHECKPOINT_S = 20.0
+_AGAIN_AT = 0.5  # share of the budget after which duplicates go once more
+_PREPARED = 0.1  # share of the progress that preparing takes
+# Several times those of 3DGS, which are made for tens of thousands of steps: here there are few,
+# each on a whole image of a map that is nearly right, and the rates fall.
+_START = LearningRates(quaternions=8e-3, scales=2e-2, opacities=5e-2, colours=2e-2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +43,7 @@ class FineResult:
 
     iterations: int
     converged: bool
-    """Whether it stopped because the loss had settled."""
+    """Whether it stopped because the losses had settled."""
     filled: int
     pruned: int
 
@@ -48,55 +58,70 @@ class FineStage:
         config: MergeConfig,
         *,
         progress: Progress,
+        checkpoint: Checkpoint | None = None,
+        done: int = 0,
+        after_pass: Callable[[int], bool] | None = None,
     ) -> None:
+        """`checkpoint` is given the cloud and the steps done every 20 s or so; a stage that begins
+        at `done` steps takes such a cloud up. `after_pass` hears the steps done and may end it."""
         self._optimiser, self._views, self._config = optimiser, views, config
-        self._progress = progress
+        self._progress, self._checkpoint, self._done = progress, checkpoint, done
+        self._after_pass = after_pass
         self._order = VisitOrder(region_weights(views), np.random.default_rng(config.seed))
         self._last_loss = np.full(len(views), np.nan)
+        self._exposure = ExposureModel(len(views)) if config.exposure else None
         self._steps_per_pass = max(len(views), _MIN_STEPS_PER_PASS)
         self._budget = min(config.iterations, config.passes * self._steps_per_pass)
 
     def run(self) -> FineResult:
-        """Fill, optimise and prune until the loss settles or the budget is spent."""
-        pruned = self._prune_unseen(_HIDDEN_SHARE * self._config.min_contribution, share=0.01)
-        filled = self._fill()
-        done, deduplicated, converged = 0, False, False
-        while done < self._budget and not converged:
-            steps = min(self._steps_per_pass, self._budget - done)
-            loss, gain = self._pass(steps, done)
-            done += steps
+        """Prune, fill and optimise until the losses settle or the budget is spent."""
+        pruned = filled = 0
+        if not self._done:
+            pruned, filled = self._prune_unseen(0.01), self._fill()
+        settled, saved = 0, time.monotonic()
+        once_more = self._done < _AGAIN_AT * self._budget
+        while self._done < self._budget and settled < _SETTLED_PASSES:
+            loss, gain = self._pass(min(self._steps_per_pass, self._budget - self._done))
             pruned += self._prune_faded()
-            self._progress(self._share(done), f"refined {done} of {self._budget} steps: {loss:.4f}")
-            settled = self._config.converged > 0.0 and gain < self._config.converged
-            converged = settled and deduplicated
-            if not deduplicated and (settled or done >= _DEDUPLICATE_AT * self._budget):
-                pruned += self._prune_unseen(self._config.min_contribution, share=self._share(done))
-                # The loss rises for a moment: it has to settle anew.
-                deduplicated = True
-                self._last_loss[:] = np.nan
-        return FineResult(done, converged, filled, pruned)
+            share = _PREPARED + (0.98 - _PREPARED) * self._done / self._budget
+            self._progress(share, f"refined {self._done} of {self._budget} steps: {loss:.4f}")
+            settled = settled + 1 if gain < self._config.converged else 0
+            if self._checkpoint is not None and time.monotonic() - saved > _CHECKPOINT_S:
+                self._checkpoint(self._optimiser.gaussians(), self._done)
+                saved = time.monotonic()
+            if once_more and self._done >= _AGAIN_AT * self._budget:
+                pruned, once_more = pruned + self._prune_unseen(share), False
+                self._last_loss[:] = np.nan  # the losses rise for a moment and have to settle anew
+            if self._after_pass is not None and self._after_pass(self._done):
+                break
+        return FineResult(self._done, settled >= _SETTLED_PASSES, filled, pruned)
 
-    def _share(self, done: int) -> float:
-        return 0.1 + 0.88 * done / max(self._budget, 1)
-
-    def _pass(self, steps: int, done: int) -> tuple[float, float]:
+    def _pass(self, steps: int) -> tuple[float, float]:
         """Mean loss of `steps` steps, and the mean share by which a view's loss fell since its
         last visit (infinite while most views have not been visited twice). Views differ more
         than passes do, so only a view's own loss tells whether the map still gets better."""
-        self._optimiser.learning_rates = rates(self._config, done / max(self._budget, 1))
         losses, gains = [], []
         for _ in range(steps):
+            self._optimiser.learning_rates = rates(self._config, self._done / self._budget)
             index = self._order.next()
-            view = self._views[index]
-            loss = self._optimiser.step(
-                view.camera, view.world_from_camera, view.colour, view.depth
-            ).loss
+            loss = self._step(index)
             if np.isfinite(self._last_loss[index]):
                 gains.append(1.0 - loss / max(self._last_loss[index], 1e-12))
             self._last_loss[index] = loss
             losses.append(loss)
+            self._done += 1
+        if self._exposure is not None:
+            self._exposure.centre()
         known = len(gains) >= 0.5 * steps
         return float(np.mean(losses)), float(np.mean(gains)) if known else float("inf")
+
+    def _step(self, index: int) -> float:
+        view, colour = self._views[index], self._views[index].colour
+        if self._exposure is not None:
+            shown = self._optimiser.render(view.camera, view.world_from_camera)
+            self._exposure.fit(index, view, shown.colour, shown.alpha)
+            colour = self._exposure.undone(index, colour)
+        return self._optimiser.step(view.camera, view.world_from_camera, colour, view.depth).loss
 
     def _fill(self) -> int:
         limits = {
@@ -115,14 +140,18 @@ class FineStage:
     def _prune_faded(self) -> int:
         return self._keep(self._optimiser.gaussians().opacities >= self._config.prune_opacity)
 
-    def _prune_unseen(self, least: float, *, share: float) -> int:
-        """Remove what no keyframe shows: duplicates of overlapping sub-maps, hidden leftovers."""
+    def _prune_unseen(self, share: float) -> int:
+        """Remove what no keyframe shows: duplicates of overlapping sub-maps, hidden leftovers.
+
+        Before everything else, since all that follows takes time in proportion to the Gaussians,
+        and once more when layers of equal rank have sorted out which of them shows.
+        """
         if self._config.min_contribution <= 0.0:
             return 0
         self._progress(share, "removing what no keyframe shows")
         rasteriser = Rasteriser(self._config.threads or None)
-        cloud = self._optimiser.gaussians()
-        return self._keep(best_contribution(cloud, self._views, rasteriser=rasteriser) > least)
+        shown = best_contribution(self._optimiser.gaussians(), self._views, rasteriser=rasteriser)
+        return self._keep(shown > self._config.min_contribution)
 
     def _keep(self, mask: np.ndarray) -> int:
         if not mask.all():
@@ -133,5 +162,5 @@ class FineStage:
 def rates(config: MergeConfig, progress: float) -> LearningRates:
     """The learning rates after a share of the budget: they fall exponentially."""
     share = config.final_rate**progress
-    base = LearningRates(means=config.means_rate_m)
-    return LearningRates(*(share * getattr(base, f.name) for f in dataclasses.fields(base)))
+    start = dataclasses.replace(_START, means=config.means_rate_m)
+    return LearningRates(*(share * getattr(start, f.name) for f in dataclasses.fields(start)))

@@ -7,7 +7,7 @@ import functools
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +17,13 @@ from magicslam.v1 import submap_pb2
 
 from magic_core.errors import MagicError
 from magic_core.geometry import Camera
-from magic_core.wire import decode_submap, geometry, images
+from magic_core.wire import geometry, images
 from magic_server.store.blobs import read_checked
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
+    from magic_core.wire.records import MapFormat
+    from magic_core.gaussians import GaussianCloud
     from magic_server.globalmap import MergeConfig
     from magic_server.posegraph import PoseGraphConfig
     from magic_server.posegraph.arrays import ArraySolution, GraphArrays
@@ -52,6 +54,47 @@ class QueryImage:
 
 
 @dataclass(frozen=True, slots=True)
+class StoredSource:
+    """A stored sub-map as a merge reads it: each part when it is asked for, and kept by nobody."""
+
+    stored: StoredSubmap
+    header: submap_pb2.SubmapHeader
+    world_from_anchor: np.ndarray  # (4, 4)
+
+    @classmethod
+    def of(cls, placed: PlacedFiles) -> StoredSource:
+        """Read the header alone."""
+        header = submap_pb2.SubmapHeader.FromString(placed.stored.header)
+        return cls(placed.stored, header, placed.world_from_anchor)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all its keyframes."""
+        return geometry.camera_from_proto(self.header.camera)
+
+    def gaussians(self) -> GaussianCloud:
+        """The Gaussians, in the anchor frame."""
+        from magic_core.gaussians import codec
+
+        return codec.decode(read_checked(self.stored.blobs[self.header.gaussians_blob]))
+
+    def gaussian_count(self) -> int:
+        """How many there are, without decoding them."""
+        from magic_core.gaussians import codec
+
+        with self.stored.blobs[self.header.gaussians_blob].open("rb") as file:
+            return codec.gaussian_count(file.read(codec.HEADER_BYTES))
+
+    def keyframe_poses(self) -> list[np.ndarray]:
+        """anchor_from_camera (4, 4) of every keyframe."""
+        return [geometry.pose_from_proto(item.anchor_from_camera) for item in self.header.keyframes]
+
+    def images(self, keyframe: int) -> tuple[np.ndarray, np.ndarray]:
+        """Colour (h, w, 3) and depth (h, w) in metres of one keyframe."""
+        return _images(self.header, self.stored, keyframe)
+
+
+@dataclass(frozen=True, slots=True)
 class MergeTask:
     """What a merge needs."""
 
@@ -60,7 +103,7 @@ class MergeTask:
     threads: int
     """Threads of the rasteriser; 0 for one per core."""
     folder: Path
-    """An empty folder for the results and the progress file."""
+    """A folder for the results, the progress file and what an interrupted merge left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +114,53 @@ class MergeOutcome:
     ply: Path
     lossless: Path
     compact: Path
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewTask:
+    """What a preview needs."""
+
+    submaps: tuple[PlacedFiles, ...]
+    kinds: tuple[MapFormat, ...]
+    folder: Path
+    """A folder that does not exist yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreviewOutcome:
+    """A preview's files: path, SHA-256 in hex and length by format."""
+
+    gaussian_count: int
+    files: tuple[tuple[MapFormat, tuple[Path, str, int]], ...]
+
+
+def append_submaps(task: PreviewTask) -> PreviewOutcome:
+    """Write placed sub-maps one behind the other, with one of them in memory at a time."""
+    import hashlib
+
+    from magic_core.gaussians import stream
+    from magic_server.globalmap.placement import placed_gaussians
+
+    sources = [StoredSource.of(item) for item in task.submaps]
+
+    def pieces() -> Iterator[GaussianCloud]:
+        return (placed_gaussians(source) for source in sources)
+
+    write = {
+        "ply": stream.write_ply_pieces,
+        "lossless": stream.write_lossless_pieces,
+        "compact": stream.write_compact_pieces,
+    }
+    task.folder.mkdir(parents=True)
+    files = []
+    for kind in task.kinds:
+        path = task.folder / kind
+        write[kind](path, pieces)
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        files.append((kind, (path, digest, path.stat().st_size)))
+    count = sum(source.gaussian_count() for source in sources)
+    return PreviewOutcome(count, tuple(files))
 
 
 def verify_loop(
@@ -114,28 +204,30 @@ def solve_pose_graph(graph: GraphArrays, config: PoseGraphConfig) -> ArraySoluti
 
 
 def merge_submaps(task: MergeTask) -> MergeOutcome:
-    """Merge placed sub-maps and write the map in every format."""
+    """Merge placed sub-maps and write the map in every format.
+
+    One block of the map is in memory at a time. A folder that an interrupted merge of the same
+    sub-maps left is taken up where it was.
+    """
     threads = task.threads or os.cpu_count() or 1
     os.environ["MAGIC_THREADS"] = str(threads)
-    from magic_core.gaussians import codec
-    from magic_core.gaussians.ply import write_ply
-    from magic_server.globalmap import PlacedSubmap, build_global_map
+    from magic_core.gaussians import stream
+    from magic_server.globalmap.merge import merge_into
 
     report = _progress_writer(task.folder / "progress.json")
-    report(0.0, "reading sub-maps")
-    placed = [
-        PlacedSubmap(_read_submap(item.stored), item.world_from_anchor) for item in task.submaps
-    ]
     config = task.config
     if not config.threads:
         config = dataclasses.replace(config, threads=threads)
-    cloud = build_global_map(placed, config, progress=report).cloud
+    sources = [StoredSource.of(item) for item in task.submaps]
+    parts, summary = merge_into(task.folder, sources, config, progress=report)
     outcome = MergeOutcome(
-        len(cloud), *(task.folder / name for name in ("map.ply", "map.lossless", "map.compact"))
+        summary.gaussians,
+        *(task.folder / name for name in ("map.ply", "map.lossless", "map.compact")),
     )
-    write_ply(outcome.ply, cloud)
-    outcome.lossless.write_bytes(codec.encode_lossless(cloud))
-    outcome.compact.write_bytes(codec.encode_compact(cloud))
+    pieces = functools.partial(parts.clouds, summary.blocks)
+    stream.write_ply_pieces(outcome.ply, pieces)
+    stream.write_lossless_pieces(outcome.lossless, pieces)
+    stream.write_compact_pieces(outcome.compact, pieces)
     return outcome
 
 
@@ -153,7 +245,7 @@ def _prepared(stored: StoredSubmap, config: RegistrationConfig) -> PreparedView:
     """A sub-map's view; kept, because a new sub-map is compared with several others in a row."""
     from magic_server.registration import prepare
 
-    return prepare(_view(stored, config.max_keyframes), config)
+    return prepare(_view(stored, config), config)
 
 
 def _query_view(image: QueryImage) -> AnchorView:
@@ -166,22 +258,27 @@ def _query_view(image: QueryImage) -> AnchorView:
     return AnchorView(camera=image.camera, colour=colour, depth=depth)
 
 
-def _view(stored: StoredSubmap, max_keyframes: int) -> AnchorView:
-    """The images of a sub-map that registration wants: the anchor's and some keyframes'."""
+def _view(stored: StoredSubmap, config: RegistrationConfig) -> AnchorView:
+    """What registration wants of a sub-map: the images of the anchor and of some keyframes."""
     from magic_server.registration import AnchorView
 
     header = submap_pb2.SubmapHeader.FromString(stored.header)
     camera = geometry.camera_from_proto(header.camera)
     others = range(1, len(header.keyframes))
-    if len(others) > max_keyframes:
-        spread = np.linspace(1, len(header.keyframes) - 1, max_keyframes)
+    if len(others) > config.max_keyframes:
+        spread = np.linspace(1, len(header.keyframes) - 1, config.max_keyframes)
         others = sorted(set(np.rint(spread).astype(int).tolist()))
     colour, depth = _images(header, stored, 0)
     keyframes = []
     for index in others:
         pose = geometry.pose_from_proto(header.keyframes[index].anchor_from_camera)
         keyframes.append((pose, *_images(header, stored, index)))
-    return AnchorView(camera=camera, colour=colour, depth=depth, keyframes=tuple(keyframes))
+    means = None
+    if "means" in config.methods:
+        from magic_core.gaussians import codec
+
+        means = codec.decode(read_checked(stored.blobs[header.gaussians_blob])).means
+    return AnchorView(camera, colour, depth, tuple(keyframes), means)
 
 
 def _images(
@@ -200,11 +297,6 @@ def _images(
         size=size,
     )
     return colour, depth
-
-
-def _read_submap(stored: StoredSubmap):
-    header = submap_pb2.SubmapHeader.FromString(stored.header)
-    return decode_submap(header, [read_checked(path) for path in stored.blobs])
 
 
 def _progress_writer(path: Path) -> Callable[[float, str], None]:

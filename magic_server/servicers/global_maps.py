@@ -8,10 +8,12 @@ from concurrent.futures import Executor
 import grpc.aio
 from magicslam.v1 import global_map_service_pb2 as map_pb
 from magicslam.v1 import global_map_service_pb2_grpc as map_grpc
+from magicslam.v1 import submap_pb2
 
-from magic_core.errors import InvalidInput
-from magic_core.wire import convert, names
+from magic_core.errors import InvalidInput, NotFound
+from magic_core.wire import convert, names, records
 from magic_server.globalmaps import GlobalMaps
+from magic_server.preview import PREVIEW_ID, Previews
 from magic_server.servicers.downloads import file_chunks
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.store import Store
@@ -24,9 +26,12 @@ DEFAULT_WAIT_S = 10.0
 class GlobalMapServicer(map_grpc.GlobalMapServiceServicer):
     """Builds and serves global maps."""
 
-    def __init__(self, store: Store, maps: GlobalMaps, *, threads: Executor) -> None:
+    def __init__(
+        self, store: Store, maps: GlobalMaps, previews: Previews, *, threads: Executor
+    ) -> None:
         self._store = store
         self._maps = maps
+        self._previews = previews
         self._threads = threads
 
     async def BuildGlobalMap(  # noqa: N802
@@ -79,13 +84,31 @@ class GlobalMapServicer(map_grpc.GlobalMapServiceServicer):
         else:
             session = names.parse_session(request.name)
         kind = convert.map_format_from_proto(request.format)
-        info, file = await self._store.maps.map_file(session, map_id, kind)
+        info, sha256, length, chunks = await self._found(session, map_id, kind)
         header = map_pb.GlobalMapHeader(
             map=convert.map_to_proto(info),
             format=convert.map_format_to_proto(kind),
-            length=file.length,
-            sha256=bytes.fromhex(file.sha256),
+            length=length,
+            sha256=bytes.fromhex(sha256),
         )
         yield map_pb.GetGlobalMapResponse(header=header)
-        async for chunk in file_chunks(self._store.blobs, file.sha256, self._threads):
+        async for chunk in chunks:
             yield map_pb.GetGlobalMapResponse(chunk=chunk)
+
+    async def _found(
+        self, session: str, map_id: str | None, kind: records.MapFormat
+    ) -> tuple[records.GlobalMapInfo, str, int, AsyncIterator[submap_pb2.BlobChunk]]:
+        """A map, its file's SHA-256 and length, and its chunks.
+
+        The preview where it is named, or where no map is and none is merged yet.
+        """
+        if map_id != PREVIEW_ID:
+            try:
+                info, file = await self._store.maps.map_file(session, map_id, kind)
+            except NotFound:
+                if map_id is not None:
+                    raise
+            else:
+                chunks = file_chunks(self._store.blobs, file.sha256, self._threads)
+                return info, file.sha256, file.length, chunks
+        return await self._previews.stream(session, kind)

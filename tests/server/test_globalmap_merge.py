@@ -83,7 +83,7 @@ def test_coarse_merge_is_the_sub_maps_moved_to_their_places():
 def test_fine_stage_improves_keyframes_and_views_between_them():
     placed = [submap(0, -0.5, 0.0), submap(1, 0.5, 0.3)]
     result = merge(placed)
-    assert result.psnr_fine_db > result.psnr_coarse_db + 2.0
+    assert result.summary.psnr_fine_db > result.summary.psnr_coarse_db + 2.0
     between = placed[0].world_from_anchor @ se3.exp([0.025, 0.0, 0.0, 0.0, 0.03, 0.0])
     assert psnr(result.cloud, between) > psnr(coarse_merge(placed), between)
     result.cloud.validate()
@@ -93,7 +93,7 @@ def test_what_keyframes_saw_but_no_sub_map_holds_is_filled():
     placed = [submap(0, 0.0, 0.0, hole=True)]
     without = merge(placed, replace(CONFIG, fill=False, fill_unmeasured=False))
     result = merge(placed)
-    assert result.filled > 100
+    assert result.summary.filled > 100
     pose = placed[0].world_from_anchor
     assert psnr(result.cloud, pose) > psnr(without.cloud, pose) + 5.0
     depth = Rasteriser(1).render(result.cloud, CAMERA, pose).expected_depth
@@ -103,8 +103,8 @@ def test_what_keyframes_saw_but_no_sub_map_holds_is_filled():
 def test_the_same_surface_mapped_twice_becomes_one_layer():
     placed = [submap(0, 0.0, 0.0), submap(1, 0.0, 0.0)]
     once, twice = len(placed[0].submap.gaussians), merge(placed)
-    assert twice.coarse_gaussians == 2 * once
-    assert twice.pruned > 0.5 * once
+    assert twice.summary.coarse_gaussians == 2 * once
+    assert twice.summary.pruned > 0.5 * once
     assert psnr(twice.cloud, placed[0].world_from_anchor) > 20.0
 
 
@@ -129,8 +129,8 @@ def test_it_stops_when_the_loss_has_settled():
     result = merge(
         [submap(0, 0.0, 0.0)], replace(CONFIG, iterations=5000, passes=100, converged=0.15)
     )
-    assert result.converged
-    assert 100 < result.iterations < 2500
+    assert result.summary.converged
+    assert 100 < result.summary.iterations < 2500
 
 
 def test_progress_rises_to_one():

@@ -1,0 +1,92 @@
+"""A merge's folder: refined blocks on disk, from which an interrupted merge goes on.
+
+plan.json           what is merged, and how: another plan starts anew
+block_0003.mgsc     a refined block, in the lossless codec
+block_0003.json     its figures; written last, it says that the block is complete
+open_0004.mgsc      the block under way, as of its last checkpoint
+open_0004.json      how far that is
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from magic_core.config import to_mapping
+from magic_core.gaussians import GaussianCloud, codec
+from magic_server.globalmap.config import MergeConfig
+from magic_server.globalmap.placement import PlacedSource
+
+
+class Parts:
+    """Blocks that are done, and how far the one under way is."""
+
+    def __init__(self, folder: Path, fingerprint: str) -> None:
+        """Take up a folder where its plan is the same, else empty it."""
+        self._folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        plan = folder / "plan.json"
+        if not plan.is_file() or plan.read_text() != json.dumps(fingerprint):
+            for pattern in ("block_*", "open_*"):
+                for leftover in folder.glob(pattern):
+                    leftover.unlink()
+            _replace(plan, json.dumps(fingerprint).encode())
+
+    def finished(self, block: int) -> dict[str, Any] | None:
+        """The figures of a block that is done."""
+        return _read_json(self._folder / f"block_{block:04d}.json")
+
+    def cloud(self, block: int) -> GaussianCloud:
+        """A block that is done."""
+        return codec.decode((self._folder / f"block_{block:04d}.mgsc").read_bytes())
+
+    def clouds(self, count: int) -> Iterator[GaussianCloud]:
+        """All blocks, one at a time."""
+        for block in range(count):
+            yield self.cloud(block)
+
+    def finish(self, block: int, cloud: GaussianCloud, figures: dict[str, Any]) -> None:
+        """Keep a block that is done."""
+        _replace(self._folder / f"block_{block:04d}.mgsc", codec.encode_lossless(cloud))
+        _replace(self._folder / f"block_{block:04d}.json", json.dumps(figures).encode())
+        for leftover in self._folder.glob(f"open_{block:04d}.*"):
+            leftover.unlink()
+
+    def checkpoint(self, block: int, cloud: GaussianCloud, figures: dict[str, Any]) -> None:
+        """Keep how far the block under way is. Adam's moments are not kept: they come back in a
+        few steps."""
+        _replace(self._folder / f"open_{block:04d}.mgsc", codec.encode_lossless(cloud))
+        _replace(self._folder / f"open_{block:04d}.json", json.dumps(figures).encode())
+
+    def resumed(self, block: int) -> tuple[GaussianCloud, dict[str, Any]] | None:
+        """The last checkpoint of a block, where there is one."""
+        figures = _read_json(self._folder / f"open_{block:04d}.json")
+        path = self._folder / f"open_{block:04d}.mgsc"
+        if figures is None or not path.is_file():
+            return None
+        return codec.decode(path.read_bytes()), figures
+
+
+def fingerprint_of(sources: Sequence[PlacedSource], config: MergeConfig) -> str:
+    """A digest of where the sub-maps are and how they are merged."""
+    digest = hashlib.sha256(json.dumps(to_mapping(config), sort_keys=True).encode())
+    for source in sources:
+        digest.update(source.world_from_anchor.tobytes())
+        digest.update(len(source.keyframe_poses()).to_bytes(4, "little"))
+    return digest.hexdigest()
+
+
+def _read_json(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text())
+    except (FileNotFoundError, ValueError):
+        return None
+
+
+def _replace(path: Path, data: bytes) -> None:
+    partial = path.with_suffix(path.suffix + ".partial")
+    partial.write_bytes(data)
+    partial.replace(path)

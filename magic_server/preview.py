@@ -1,0 +1,211 @@
+"""A merged preview of each session that follows its pose graph while agents run.
+
+Sub-maps are appended as they were sent, each moved by its one transform; nothing is optimised. The
+preview is built in a worker, one sub-map in memory at a time, and lies on disk. Whoever asks gets
+the last one at once, at most a few seconds behind the pose graph.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import shutil
+import time
+import zlib
+from collections.abc import AsyncIterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+from magicslam.v1 import mapping_service_pb2 as mapping_pb
+from magicslam.v1 import submap_pb2
+
+from magic_core.errors import NotFound, WrongState
+from magic_core.wire import MAX_CHUNK_BYTES, geometry, names, records
+from magic_core.wire.convert import moment
+from magic_server.coordinator import SessionCoordinator
+from magic_server.jobs import JobExecutor
+from magic_server.jobs.tasks import PlacedFiles, PreviewTask, append_submaps
+from magic_server.preview_config import PreviewConfig
+from magic_server.sessions import Sessions
+from magic_server.store import Store
+from magic_server.tasks import TaskScope
+
+logger = logging.getLogger(__name__)
+
+PREVIEW_ID = "preview"
+_FOLDER = "previews"
+_REST = 10.0  # between two previews at least so many times as long as one takes
+_TICK_S = 0.5
+
+
+@dataclass(slots=True)
+class _Preview:
+    """The last preview of a session."""
+
+    info: records.GlobalMapInfo
+    files: dict[records.MapFormat, tuple[Path, str, int]]
+    """Path, SHA-256 in hex and length of each format that was asked for."""
+    took_s: float
+    made_at: float
+    """Monotonic clock."""
+
+
+class Previews:
+    """The previews of all sessions of a server."""
+
+    def __init__(
+        self,
+        store: Store,
+        sessions: Sessions,
+        *,
+        jobs: JobExecutor,
+        threads: Executor,
+        config: PreviewConfig,
+    ) -> None:
+        self._store, self._sessions = store, sessions
+        self._jobs, self._threads, self._config = jobs, threads, config
+        self._root = store.folder / _FOLDER
+        self._last: dict[int, _Preview] = {}
+        self._locks: dict[int, asyncio.Lock] = {}
+        self._seen: dict[int, int] = {}
+        self._tasks = TaskScope("previews")
+
+    async def start(self) -> None:
+        """Drop what an earlier server left, and begin to follow the sessions' pose graphs."""
+        await self._in_thread(shutil.rmtree, self._root, True)
+        for coordinator in self._sessions.live():
+            self._seen[coordinator.session.id] = coordinator.board.revision
+        if self._config.enabled:
+            self._tasks.start(self._follow(), name="follow")
+
+    async def close(self) -> None:
+        """Stop following."""
+        await self._tasks.close()
+
+    async def stream(
+        self, session: str, kind: records.MapFormat
+    ) -> tuple[records.GlobalMapInfo, str, int, AsyncIterator[submap_pb2.BlobChunk]]:
+        """The last preview of a session: what it is, its SHA-256 and length, and its chunks.
+
+        Made now where there is none in this format. NotFound while no sub-map is placed.
+        """
+        row = await self._store.agents.session(session)
+        coordinator = await self._sessions.coordinator(row)
+        last = self._last.get(row.id)
+        if last is None or kind not in last.files:
+            last = await self._made(coordinator, kind)
+        path, sha256, length = last.files[kind]
+        file = await self._in_thread(path.open, "rb")  # a newer preview leaves this one readable
+        return last.info, sha256, length, self._chunks(file)
+
+    async def _follow(self) -> None:
+        """Build anew whatever session's pose graph has changed, one after another."""
+        while True:
+            await asyncio.sleep(_TICK_S)
+            live = self._sessions.live()
+            await self._drop_all_but({coordinator.session.id for coordinator in live})
+            for coordinator in live:
+                if self._is_due(coordinator):
+                    self._seen[coordinator.session.id] = coordinator.board.revision
+                    with contextlib.suppress(NotFound):
+                        await self._tried(coordinator)
+
+    def _is_due(self, coordinator: SessionCoordinator) -> bool:
+        session = coordinator.session.id
+        if coordinator.board.revision <= self._seen.get(session, 0):
+            return False
+        last = self._last.get(session)
+        if last is None:
+            return True
+        rest = max(self._config.interval_s, _REST * last.took_s)
+        return time.monotonic() - last.made_at >= rest
+
+    async def _tried(self, coordinator: SessionCoordinator) -> None:
+        try:
+            await self._made(coordinator, None)
+        except NotFound:
+            raise
+        except Exception:
+            # The last preview stays; the next change of the pose graph tries again.
+            logger.exception("the preview of %s failed", coordinator.session.name)
+
+    async def _made(
+        self, coordinator: SessionCoordinator, asked: records.MapFormat | None
+    ) -> _Preview:
+        """Build a session's preview in all formats that were asked for so far."""
+        session = coordinator.session
+        async with self._locks.setdefault(session.id, asyncio.Lock()):
+            last = self._last.get(session.id)
+            if last is not None and asked in last.files:
+                return last
+            kinds: set[records.MapFormat] = set(last.files) if last else {"lossless"}
+            kinds |= {asked} if asked else set()
+            started = time.monotonic()
+            snapshot = coordinator.board.snapshot
+            chosen = _largest(snapshot)
+            folder = self._root / str(session.id) / f"{snapshot.revision}-{time.monotonic_ns()}"
+            task = PreviewTask(
+                await self._placed(coordinator, chosen), tuple(sorted(kinds)), folder
+            )
+            outcome = await self._jobs.run(append_submaps, task)
+            info = records.GlobalMapInfo(
+                name=names.map_name(session.name, PREVIEW_ID),
+                component=chosen[0].component,
+                revision=snapshot.revision,
+                submaps=tuple(pose.submap for pose in chosen),
+                gaussian_count=outcome.gaussian_count,
+                created_at=moment(time.time()),
+            )
+            now = time.monotonic()
+            made = _Preview(info, dict(outcome.files), took_s=now - started, made_at=now)
+            self._last[session.id] = made
+            if last is not None:
+                older = next(iter(last.files.values()))[0].parent
+                await self._in_thread(shutil.rmtree, older, True)
+            return made
+
+    async def _placed(
+        self, coordinator: SessionCoordinator, chosen: list[mapping_pb.CorrectedPose]
+    ) -> tuple[PlacedFiles, ...]:
+        placed = []
+        for pose in chosen:
+            _, agent, index = names.parse_submap(pose.submap)
+            stored = await self._store.submaps.stored(coordinator.session, agent, index)
+            transform = geometry.pose_from_proto(pose.world_from_anchor)
+            placed.append(PlacedFiles(pose.submap, stored, transform))
+        return tuple(placed)
+
+    async def _drop_all_but(self, live: set[int]) -> None:
+        """Forget sessions that were deleted."""
+        for session in self._last.keys() - live:
+            del self._last[session]
+            await self._in_thread(shutil.rmtree, self._root / str(session), True)
+
+    async def _chunks(self, file) -> AsyncIterator[submap_pb2.BlobChunk]:
+        def piece(offset: int) -> submap_pb2.BlobChunk | None:
+            data = file.read(MAX_CHUNK_BYTES)
+            if not data:
+                return None
+            return submap_pb2.BlobChunk(offset=offset, data=data, crc32=zlib.crc32(data))
+
+        try:
+            offset = 0
+            while (chunk := await self._in_thread(piece, offset)) is not None:
+                yield chunk
+                offset += len(chunk.data)
+        finally:
+            file.close()
+
+    async def _in_thread(self, function, *arguments):
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _largest(snapshot: mapping_pb.PoseSnapshot) -> list[mapping_pb.CorrectedPose]:
+    from magic_server.globalmaps import chosen_poses
+
+    try:
+        return chosen_poses(snapshot, "")
+    except WrongState as error:
+        raise NotFound(f"{snapshot.session} has no placed sub-maps yet; nothing to show") from error

@@ -1,0 +1,113 @@
+"""The preview of a session in progress: there before any merge, and where the pose graph says."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from magic_agent.client import MagicClient
+from magic_core.errors import NotFound
+from magic_core.gaussians import GaussianCloud
+from magic_core.gaussians.ply import read_ply
+from magic_server.config import ListenConfig, ServerConfig
+from magic_server.jobs import JobConfig
+from magic_server.preview_config import PreviewConfig
+from magic_server.server import Server
+from tests.small_world import DIMENSION, MODEL_ID, make_submap
+
+PREVIEW = "sessions/room/maps/preview"
+
+
+def config_of(folder, **preview) -> ServerConfig:
+    return ServerConfig(
+        data_dir=folder,
+        listen=ListenConfig(port=0, stop_grace_s=1.0),
+        jobs=JobConfig(workers=1, niceness=0),
+        preview=PreviewConfig(**preview),
+    )
+
+
+def expected_cloud(snapshot, submaps) -> GaussianCloud:
+    """The sub-maps as they were sent, where the server says they are."""
+    return GaussianCloud.concatenate(
+        [s.gaussians.transformed(snapshot.poses[s.name].world_from_anchor) for s in submaps]
+    )
+
+
+def assert_same_places(found: GaussianCloud, expected: GaussianCloud) -> None:
+    assert len(found) == len(expected)
+    for cloud_axis, expected_axis in zip(found.means.T, expected.means.T, strict=True):
+        np.testing.assert_allclose(np.sort(cloud_axis), np.sort(expected_axis), atol=6e-4)
+
+
+async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path):
+    submaps = [make_submap(agent=0, index=i) for i in range(3)]
+    server_config = config_of(tmp_path, interval_s=0.1)
+    async with Server(server_config) as server, MagicClient(server.address) as client:
+        await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+        with pytest.raises(NotFound, match="nothing to show"):
+            await client.get_global_map("sessions/room")
+        await client.submit_submap(submaps[0])
+        await client.get_corrected_poses("room")
+        info, _ = await placed(client, 1)
+        for submap in submaps[1:]:
+            await client.submit_submap(submap)
+        info, cloud = await placed(client, 3)
+        snapshot = await client.get_corrected_poses("room")
+        assert info.name == PREVIEW
+        assert info.submaps == tuple(s.name for s in submaps)
+        assert info.gaussian_count == len(cloud)
+        assert_same_places(cloud, expected_cloud(snapshot, submaps))
+        assert not await client.list_operations("room")
+
+        # Any format, and the plain session's name too, while nothing is merged.
+        _, ply = await client.download_global_map("sessions/room", format="ply")
+        (tmp_path / "p.ply").write_bytes(ply)
+        assert len(read_ply(tmp_path / "p.ply")) == len(cloud)
+        assert len(list((tmp_path / "previews").glob("*/*"))) == 1  # older ones are gone
+
+        merged = await client.build_global_map("room", coarse_only=True)
+        newest, _ = await client.download_global_map("sessions/room")
+        assert newest.name == merged.name
+
+
+async def eventually(condition) -> None:
+    """Return once an awaited condition holds."""
+    async with asyncio.timeout(60.0):
+        while not await condition():  # noqa: ASYNC110  # the state is the server's
+            await asyncio.sleep(0.05)
+
+
+async def placed(client: MagicClient, count: int):
+    """The preview, once it holds so many sub-maps."""
+
+    async def complete() -> bool:
+        try:
+            info, _ = await client.download_global_map(PREVIEW, format="lossless")
+        except NotFound:
+            return False
+        return len(info.submaps) == count
+
+    await eventually(complete)
+    info, _ = await client.download_global_map(PREVIEW, format="lossless")
+    return info, await client.get_global_map(PREVIEW)
+
+
+async def test_without_following_it_is_made_when_asked_for(tmp_path):
+    server_config = config_of(tmp_path, enabled=False)
+    async with Server(server_config) as server, MagicClient(server.address) as client:
+        await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+        submap = make_submap(agent=0, index=0)
+        await client.submit_submap(submap)
+
+        async def is_placed() -> bool:
+            return bool((await client.get_corrected_poses("room")).poses)
+
+        await eventually(is_placed)
+        await asyncio.sleep(0)
+        assert not (tmp_path / "previews").exists()
+        assert len(await client.get_global_map(PREVIEW)) == len(submap.gaussians)
+        with pytest.raises(NotFound):
+            await client.get_global_map("sessions/nowhere/maps/preview")
