@@ -7,7 +7,7 @@ from numba import njit
 
 COMPARED = 0
 CONFIRMED = 1
-IN_FRONT = 2
+CONTRADICTED = 2
 SQUARED_ERROR = 3
 TEXTURE_SUMS = slice(4, 10)  # count, a, b, aa, bb, ab
 COLOUR_SUMS = slice(10, 16)
@@ -18,6 +18,8 @@ ROBUST_WIDTH = 2.0
 """Residuals of so many standard deviations get a quarter of the full weight."""
 FREE_SPACE_SIGMAS = 6.0
 FREE_SPACE_MARGIN_M = 0.05
+BACK_COSINE = 0.2
+"""Beyond this cosine a surface faces away: both views cannot see it. Normals at edges are noise."""
 CONFIRM_SIGMAS = 3.0
 CONFIRM_MARGIN_M = 0.01
 
@@ -78,20 +80,26 @@ def linearise(
 
 @njit(cache=True, nogil=True)
 def compare(
-    points, texture, colour, variance, fixed_from_source, intrinsics, depth, depth_variance,
-    normals, fixed_texture, fixed_colour, figures,
+    points, texture, colour, variance, camera_centre, fixed_from_source, intrinsics, depth,
+    depth_variance, normals, fixed_texture, fixed_colour, figures,
 ):  # fmt: skip
     """Add to figures (FIGURES,) how one image's points look in another image.
 
-    COMPARED: fall on a depth reading; CONFIRMED: agree with it; IN_FRONT: stand where the other
-    image saw through; SQUARED_ERROR: sum of squared point-to-plane distances of the confirmed;
-    sums of texture and of colour (deviation from grey) for their correlation.
+    COMPARED: fall on a depth reading; CONFIRMED: agree with it; CONTRADICTED: stand where the
+    other image saw through, or on a surface of which their own camera would see the back;
+    SQUARED_ERROR: sum of squared point-to-plane distances of the confirmed; sums of texture and
+    of colour (deviation from grey) for their correlation. camera_centre (3,): where the points
+    were seen from, in their frame.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics
+    m = fixed_from_source
+    sx, sy, sz = camera_centre
+    eye_x = m[0, 0] * sx + m[0, 1] * sy + m[0, 2] * sz + m[0, 3]
+    eye_y = m[1, 0] * sx + m[1, 1] * sy + m[1, 2] * sz + m[1, 3]
+    eye_z = m[2, 0] * sx + m[2, 1] * sy + m[2, 2] * sz + m[2, 3]
     for index in range(points.shape[0]):
         px, py, pz = points[index, 0], points[index, 1], points[index, 2]
-        m = fixed_from_source
         x = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
         y = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
         z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
@@ -109,16 +117,18 @@ def compare(
         if z < d and _least_around(depth, iu, iv) - z > (
             FREE_SPACE_MARGIN_M + FREE_SPACE_SIGMAS * sigma
         ):
-            figures[IN_FRONT] += 1.0
+            figures[CONTRADICTED] += 1.0
             continue
         error = z - d
-        if normals[iv, iu, 2] != 0.0 and abs(error) < 0.2:
-            error = (
-                normals[iv, iu, 0] * (x - (iu - cx) / fx * d)
-                + normals[iv, iu, 1] * (y - (iv - cy) / fy * d)
-                + normals[iv, iu, 2] * (z - d)
-            )
+        nx, ny, nz = normals[iv, iu, 0], normals[iv, iu, 1], normals[iv, iu, 2]
+        if nz != 0.0 and abs(error) < 0.2:
+            error = nx * (x - (iu - cx) / fx * d) + ny * (y - (iv - cy) / fy * d) + nz * (z - d)
         if abs(error) > CONFIRM_MARGIN_M + CONFIRM_SIGMAS * sigma:
+            continue
+        ex, ey, ez = eye_x - x, eye_y - y, eye_z - z
+        facing = nx * ex + ny * ey + nz * ez
+        if facing < -BACK_COSINE * np.sqrt(ex * ex + ey * ey + ez * ez):
+            figures[CONTRADICTED] += 1.0
             continue
         figures[CONFIRMED] += 1.0
         figures[SQUARED_ERROR] += error * error

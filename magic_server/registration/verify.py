@@ -37,7 +37,8 @@ class Figures:
     colour_spread: float
     """Their standard deviation, the smaller of the two views (0 to 1); grey places have none."""
     free_space: float
-    """Share of compared readings that stand in space the other view saw through."""
+    """Share of compared readings that stand in space the other view saw through, or on the back
+    of what it saw."""
 
     @property
     def score(self) -> float:
@@ -60,9 +61,10 @@ def figures_of(
     shares = []
     for pair in pairs:
         a, b = source.at(pair.source, level), target.at(pair.target, level)
-        forward = _compare(a, b, a.points, b.camera_from_anchor @ target_from_source)
-        back = _compare(b, a, se3.transform_points(source_from_target, b.points),
-                        a.camera_from_anchor)  # fmt: skip
+        eye_a, eye_b = (se3.inverse(view.camera_from_anchor)[:3, 3] for view in (a, b))
+        forward = _compare(a, b, a.points, eye_a, b.camera_from_anchor @ target_from_source)
+        seen_b = se3.transform_points(source_from_target, np.vstack([b.points, eye_b]))
+        back = _compare(b, a, seen_b[:-1], seen_b[-1], a.camera_from_anchor)
         totals += forward + back
         shares.append(
             0.5 * forward[projective.CONFIRMED] / max(len(a.points), 1)
@@ -77,7 +79,7 @@ def figures_of(
         texture_correlation=_correlation(totals[projective.TEXTURE_SUMS]),
         colour_correlation=_correlation(totals[projective.COLOUR_SUMS]),
         colour_spread=_spread(totals[projective.COLOUR_SUMS]),
-        free_space=float(totals[projective.IN_FRONT] / compared),
+        free_space=float(totals[projective.CONTRADICTED] / compared),
     )
 
 
@@ -110,10 +112,12 @@ def refusal(figures: Figures, inliers: int, information: Array, config: Registra
     return next((reason for reason, passed in gates if not passed), "")
 
 
-def _compare(moving: Sampling, fixed: Sampling, points: Array, fixed_from_source: Array) -> Array:
+def _compare(
+    moving: Sampling, fixed: Sampling, points: Array, centre: Array, fixed_from_source: Array
+) -> Array:
     figures = np.zeros(projective.FIGURES)
     projective.compare(
-        points, moving.texture, moving.colour, moving.variance, fixed_from_source,
+        points, moving.texture, moving.colour, moving.variance, centre, fixed_from_source,
         fixed.intrinsics, fixed.level.depth, fixed.depth_variance, fixed.level.normals,
         fixed.level.texture, fixed.level.colour, figures,
     )  # fmt: skip

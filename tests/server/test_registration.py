@@ -150,6 +150,19 @@ def test_a_plain_wall_does_not_claim_what_it_cannot_see():
     assert least[False] > CONFIG.min_information
 
 
+def test_two_sides_of_a_wall_are_two_places():
+    """Wall-paper that looks alike from both sides fits perfectly, from behind it too."""
+    view = Pyramids(prepare(wall_view(plain=False), CONFIG), CONFIG)
+    behind = se3.from_rotation_translation(se3.rotation_exp([0.0, np.pi, 0.0]), [0.0, 0.0, 4.0])
+    pairs = (FramePair(0, 0),)
+    figures = figures_of(view, view, behind, pairs=pairs, level=0)
+    assert figures.fitness == 0.0
+    assert figures.free_space > 0.95
+    front = figures_of(view, view, np.eye(4), pairs=pairs, level=0)
+    assert front.fitness > 0.95
+    assert front.free_space == 0.0
+
+
 def test_information_is_bounded_by_the_systematic_error():
     huge = np.eye(6) * 1e15
     covariance = np.linalg.inv(loop_information(huge, CONFIG))
