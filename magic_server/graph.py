@@ -110,10 +110,11 @@ class SessionGraph:
         accepted = [loop for loop in self._loops.values() if loop.verdict == "ACCEPTED"]
         return Facts(tuple(self._vertices.values()), tuple(accepted))
 
-    def restore(self, facts: Facts, snapshot: mapping_pb.PoseSnapshot) -> None:
+    def restore(self, facts: Facts, snapshot: mapping_pb.PoseSnapshot, settled: bool) -> None:
         """Begin the solver anew, where a solution put things. Slow: not in the event loop.
 
-        What the solution does not hold is told with the next change.
+        What the solution does not hold is told with the next change. A `settled` one was solved as
+        a whole with all the loops that it counts.
         """
         self.online = OnlineGraph(self._config)
         self.edition += 1
@@ -123,6 +124,7 @@ class SessionGraph:
             [_loop_edge(loop) for loop in facts.loops],
             poses={name: (pose.component, pose.world_from_anchor) for name, pose in stored.items()},
             kept=[number for number, loop in enumerate(facts.loops) if loop.kept],
+            settled=settled and snapshot.loop_count == len(facts.loops),
         )
 
     def advance(self, solution: ArraySolution | None) -> Change:

@@ -7,6 +7,7 @@ import asyncio
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core.errors import MagicError, Unavailable
+from magic_server.snapshot_changes import copied, copy_head, merge
 
 
 class PoseBoard:
@@ -29,7 +30,7 @@ class PoseBoard:
     def snapshot(self) -> mapping_pb.PoseSnapshot:
         """The newest solution; never changed after it was handed out."""
         if self._public is None:
-            self._public = _copy(self._whole)
+            self._public = copied(self._whole)
         return self._public
 
     @property
@@ -57,16 +58,16 @@ class PoseBoard:
     def apply(self, change: mapping_pb.PoseSnapshot) -> None:
         """A new revision, of which the message holds new and changed poses only, and wake all."""
         if self._public is self._whole:
-            self._whole = _copy(self._whole)
+            self._whole = copied(self._whole)
         self._public = None
-        for name in _merge(self._whole, change, self._row):
+        for name in merge(self._whole, change, self._row):
             self._index(name, len(self._row))
         self._wake()
 
     def merged(self, change: mapping_pb.PoseSnapshot) -> mapping_pb.PoseSnapshot:
         """The whole as `apply` would leave it; nothing is published."""
-        whole = _copy(self._whole)
-        _merge(whole, change, self._row)
+        whole = copied(self._whole)
+        merge(whole, change, self._row)
         return whole
 
     def close(self, error: MagicError | None = None) -> None:
@@ -78,7 +79,7 @@ class PoseBoard:
         """The newest solution with the poses of one agent only; made once per solution."""
         if agent not in self._of_agent:
             chosen = mapping_pb.PoseSnapshot()
-            _copy_head(self._whole, chosen)
+            copy_head(self._whole, chosen)
             rows = self._rows_of_agent.get(agent, ())
             chosen.poses.extend(self._whole.poses[row] for row in rows)
             self._of_agent[agent] = chosen
@@ -100,36 +101,3 @@ class PoseBoard:
         self._of_agent.clear()
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
-
-
-def _copy(snapshot: mapping_pb.PoseSnapshot) -> mapping_pb.PoseSnapshot:
-    copy = mapping_pb.PoseSnapshot()
-    copy.CopyFrom(snapshot)
-    return copy
-
-
-def _copy_head(source: mapping_pb.PoseSnapshot, target: mapping_pb.PoseSnapshot) -> None:
-    """Everything but the poses."""
-    target.session = source.session
-    target.revision = source.revision
-    target.solved_at.CopyFrom(source.solved_at)
-    del target.components[:]
-    target.components.extend(source.components)
-    target.loop_count, target.loops_kept = source.loop_count, source.loops_kept
-    if not source.HasField("solved_at"):
-        target.ClearField("solved_at")
-
-
-def _merge(
-    whole: mapping_pb.PoseSnapshot, change: mapping_pb.PoseSnapshot, row: dict[str, int]
-) -> list[str]:
-    """Write a change into a solution; returns the names of sub-maps that are new, in order."""
-    _copy_head(change, whole)
-    new = []
-    for pose in change.poses:
-        if pose.submap in row:
-            whole.poses[row[pose.submap]].CopyFrom(pose)
-        else:
-            whole.poses.append(pose)
-            new.append(pose.submap)
-    return new

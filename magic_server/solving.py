@@ -71,21 +71,19 @@ class Solving:
 
     async def start(self, *, on_idle: Callable[[], Awaitable[None]]) -> None:
         """Take up the stored solution; the graph must hold all sub-maps and loops."""
-        stored, changes = await self._store.loops.solution(self._session)
-        if stored is not None:
-            self.board.publish(mapping_pb.PoseSnapshot.FromString(stored))
-        for change in changes:
+        stored = await self._store.loops.solution(self._session)
+        if stored.whole is not None:
+            self.board.publish(mapping_pb.PoseSnapshot.FromString(stored.whole))
+        for change in stored.changes:
             self.board.apply(mapping_pb.PoseSnapshot.FromString(change))
-        self._journal_bytes = sum(len(change) for change in changes)
+        self._journal_bytes = sum(len(change) for change in stored.changes)
         self._on_idle = on_idle
-        await self._restore()
+        await self._restore(settled=stored.settled)
         self.wake()
 
     def wake(self) -> None:
         """There is something new in the graph."""
         self._news.set()
-        if self._graph.online.unsettled:
-            self._unsettled.set()
 
     @property
     def busy(self) -> bool:
@@ -158,6 +156,7 @@ class Solving:
 
     async def _publish(self, change: Change) -> None:
         revision = self.board.revision + 1
+        settled = not self._graph.online.unsettled
         message = await self._in_thread(self._graph.message, change, revision)
         data = message.SerializeToString()
         if self._journal_is_long(len(data)):
@@ -165,7 +164,7 @@ class Solving:
             data = await self._in_thread(whole.SerializeToString)
             kept = self._graph.kept_loops()
             await self._store.loops.save_solution(
-                self._session, revision=revision, snapshot=data, kept=kept
+                self._session, revision=revision, snapshot=data, kept=kept, settled=settled
             )
             self._journal_bytes = 0
             self.board.publish(whole)
@@ -176,6 +175,7 @@ class Solving:
                 change=data,
                 taken_up=self._graph.ends_of(change.taken_up),
                 dropped=self._graph.ends_of(change.dropped),
+                settled=settled,
             )
             self._journal_bytes += len(data)
             self.board.apply(message)
@@ -194,9 +194,9 @@ class Solving:
             await self._restore()
         self._news.set()
 
-    async def _restore(self) -> None:
+    async def _restore(self, *, settled: bool = False) -> None:
         facts = self._graph.facts()
-        await self._in_thread(self._graph.restore, facts, self.board.snapshot)
+        await self._in_thread(self._graph.restore, facts, self.board.snapshot, settled)
 
     def _journal_is_long(self, added: int) -> bool:
         limit = max(JOURNAL_SHARE * self.board.bytes, LEAST_JOURNAL_BYTES)

@@ -112,8 +112,12 @@ class OnlineGraph:
         *,
         poses: Mapping[str, tuple[str, Array]],
         kept: Iterable[int],
+        settled: bool,
     ) -> None:
-        """Take up what was told before: (component, world_from_anchor) of vertices, loops kept."""
+        """Take up what was told before: (component, world_from_anchor) of vertices, loops kept.
+
+        `settled` says that a solve of the whole graph stands behind it.
+        """
         for vertex in vertices:
             self._add_vertex(vertex)
         for loop in loops:
@@ -128,7 +132,7 @@ class OnlineGraph:
             self._told_kept[number] = True
         self._touched = set(np.flatnonzero(np.isnan(self._told[:, 0, 0])).tolist())
         self._count_members()
-        self.unsettled = bool(vertices)
+        self.unsettled = bool(vertices) and not settled
 
     def advance(
         self,

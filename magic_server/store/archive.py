@@ -12,6 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from magic_core.errors import AlreadyExists, NotFound
 from magic_core.submap import OdometryEdge
 from magic_core.wire import convert, geometry, names, records
+from magic_server.snapshot_changes import merged_bytes
 from magic_server.store.database import Database
 from magic_server.store.loops import loop_columns, loop_record
 from magic_server.store.rows import NewSubmap, SessionRow, pack, unpack
@@ -22,6 +23,7 @@ from magic_server.store.schema import (
     maps,
     removed_submaps,
     sessions,
+    snapshot_changes,
     snapshots,
     submap_blobs,
     submaps,
@@ -86,9 +88,7 @@ class ArchiveTable:
                     removed_submaps.c.agent_id,
                 ),
                 loops=await _all(connection, sa.select(loops).filter_by(**mine), loops.c.id),
-                snapshot=await connection.scalar(
-                    sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == row.id)
-                ),
+                snapshot=await _solution(connection, row.id),
                 maps=await _all(connection, sa.select(maps).filter_by(**mine), maps.c.id),
                 map_files=await _all(connection, files, map_files.c.map_id),
             )
@@ -245,6 +245,17 @@ async def _insert_submap(
         for position, digest in enumerate(one.submap.digests)
     ]
     await connection.execute(sa.insert(submap_blobs), rows)
+
+
+async def _solution(connection: AsyncConnection, session_id: int) -> bytes | None:
+    """The newest solution, None before the first."""
+    whole = await connection.scalar(
+        sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == session_id)
+    )
+    since = sa.select(snapshot_changes.c.change)
+    since = since.where(snapshot_changes.c.session_id == session_id)
+    changes = await connection.scalars(since.order_by(snapshot_changes.c.revision))
+    return None if whole is None else merged_bytes(whole, changes)
 
 
 async def _insert_rest(

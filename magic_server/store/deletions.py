@@ -254,6 +254,7 @@ async def _replace_solution(
     if solution is not None:
         change = sa.update(snapshots).where(snapshots.c.session_id == session.id)
         values = {"revision": solution.revision, "snapshot": solution.snapshot}
+        values["settled"] = False
         await connection.execute(change.values(values))
         old = sa.delete(snapshot_changes)
         await connection.execute(old.where(snapshot_changes.c.session_id == session.id))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import sqlalchemy as sa
 
@@ -10,6 +11,18 @@ from magic_core.wire import names, records
 from magic_server.store.database import Database
 from magic_server.store.rows import SessionRow, pack, unpack
 from magic_server.store.schema import agents, loops, snapshot_changes, snapshots, submaps
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSolution:
+    """A session's newest solution: serialised PoseSnapshots."""
+
+    whole: bytes | None
+    """None before the first."""
+    changes: tuple[bytes, ...]
+    """Of the revisions since, oldest first: new and changed poses only."""
+    settled: bool
+    """Whether a solve of the whole graph stands behind it."""
 
 
 class LoopTable:
@@ -87,12 +100,15 @@ class LoopTable:
         revision: int,
         snapshot: bytes,
         kept: Collection[tuple[str, str]],
+        settled: bool,
     ) -> None:
         """Replace the session's solution and the changes to it.
 
-        `kept` holds the (source, target) of the loops it relies on.
+        `kept` holds the (source, target) of the loops it relies on; `settled` says whether a solve
+        of the whole graph stands behind it.
         """
         row = {"session_id": session.id, "revision": revision, "snapshot": snapshot}
+        row["settled"] = settled
         mine = loops.c.session_id == session.id
         async with self._database.write() as connection:
             await connection.execute(
@@ -120,6 +136,7 @@ class LoopTable:
         change: bytes,
         taken_up: Collection[tuple[str, str]],
         dropped: Collection[tuple[str, str]],
+        settled: bool,
     ) -> None:
         """Add a revision on top of the solution: a PoseSnapshot with the changed poses only.
 
@@ -128,6 +145,8 @@ class LoopTable:
         row = {"session_id": session.id, "revision": revision, "change": change}
         async with self._database.write() as connection:
             await connection.execute(sa.insert(snapshot_changes), row)
+            whole = sa.update(snapshots).where(snapshots.c.session_id == session.id)
+            await connection.execute(whole.values(revision=revision, settled=settled))
             for ends, kept in ((taken_up, True), (dropped, False)):
                 for source, target in ends:
                     mine = sa.update(loops).where(
@@ -137,18 +156,18 @@ class LoopTable:
                     )
                     await connection.execute(mine.values(kept=kept))
 
-    async def solution(self, session: SessionRow) -> tuple[bytes | None, list[bytes]]:
-        """The stored solution, None before the first, and the changes since, oldest first.
-
-        All of them are serialised PoseSnapshots.
-        """
-        whole = sa.select(snapshots.c.snapshot).where(snapshots.c.session_id == session.id)
+    async def solution(self, session: SessionRow) -> StoredSolution:
+        """The newest solution, as it was stored piece by piece."""
+        whole = sa.select(snapshots.c.snapshot, snapshots.c.settled)
+        whole = whole.where(snapshots.c.session_id == session.id)
         since = sa.select(snapshot_changes.c.change)
         since = since.where(snapshot_changes.c.session_id == session.id)
         async with self._database.read() as connection:
-            stored = await connection.scalar(whole)
+            stored = (await connection.execute(whole)).one_or_none()
             changes = await connection.scalars(since.order_by(snapshot_changes.c.revision))
-            return stored, list(changes)
+            if stored is None:
+                return StoredSolution(None, (), settled=True)
+            return StoredSolution(stored.snapshot, tuple(changes), settled=stored.settled)
 
 
 def loop_columns(loop: records.LoopCandidate) -> dict[str, object]:

@@ -137,8 +137,10 @@ snapshots = sa.Table(
     "snapshots",
     metadata,
     sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
-    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("revision", sa.Integer, nullable=False),  # with the changes since
     sa.Column("snapshot", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
+    # Whether a solve of the whole graph stands behind it and the changes since.
+    sa.Column("settled", sa.Boolean, nullable=False, default=False),
 )
 
 # Revisions since the stored solution, each with the poses that it changed.

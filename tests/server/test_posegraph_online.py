@@ -133,7 +133,8 @@ def test_a_restored_graph_goes_on_where_it_was_and_tells_what_nobody_was_told():
     graph.advance([], [loop])
     told = {name: (graph.names[0], graph.poses[i]) for i, name in enumerate(graph.names)}
     again = OnlineGraph(TRUSTING)
-    again.restore(vertices, [loop], poses=told, kept=[0])
+    again.restore(vertices, [loop], poses=told, kept=[0], settled=True)
+    assert not again.unsettled
     change = again.advance([], [])
     assert change.vertices.tolist() == [9]
     assert not len(change.taken_up)
