@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
 from contextlib import asynccontextmanager
@@ -10,6 +11,7 @@ from contextlib import asynccontextmanager
 from magic_core.errors import MagicError
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
+from magic_server.graph import SessionGraph
 from magic_server.jobs import JobExecutor
 from magic_server.metrics import Metrics
 from magic_server.places import DescriptorIndex
@@ -38,8 +40,8 @@ class Sessions:
 
     async def start(self) -> None:
         """Take up every stored session."""
-        # Loads the index library now: that would hold up the event loop later.
-        await asyncio.get_running_loop().run_in_executor(self._threads, DescriptorIndex, 1)
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._threads, _load_libraries, self._config)
         for session in await self._store.agents.sessions():
             await self.coordinator(session)
 
@@ -118,3 +120,10 @@ class Sessions:
         """The coordinator of a session's id; NotFound when there is no such session."""
         found = self._coordinators.get(session)
         return found or await self.coordinator(await self._store.agents.session(session))
+
+
+def _load_libraries(config: ServerConfig) -> None:
+    """Load what the first sub-map and the first verdict need: later it would hold up the loop."""
+    DescriptorIndex(1)
+    SessionGraph("", config.posegraph)
+    importlib.import_module("magic_server.registration.register")

@@ -142,7 +142,11 @@ def _serve(settings: dict[str, Any]) -> None:
 
 def main() -> None:
     """Fork a server for every line; kill what still runs when the lines end."""
-    import magic_server.server  # noqa: F401  # everything a server needs, once
+    # Everything a server needs, once.
+    import scipy.special  # noqa: F401
+
+    import magic_server.registration.register
+    import magic_server.server  # noqa: F401
 
     running: set[int] = set()
 
