@@ -70,7 +70,14 @@ class MappingConfig:
     prune_scale: float = 0.25
     """Gaussians with a standard deviation above this share of the median depth are removed."""
     max_gaussians: int = 100_000
-    """Bound of one sub-map: when it is reached nothing more is seeded."""
+    """Bound of one sub-map: when it is reached nothing more is seeded. With `max_keyframes` it
+    bounds the agent's memory."""
+    max_keyframes: int = 40
+    """Keyframes of one sub-map whose images are kept; the one that the others cover best makes
+    room."""
+    exposure_step: float = 0.2
+    """Change of brightness, as a share of full scale, from which a keyframe is brought to the
+    sub-map's exposure before it is mapped; 0 never does."""
     ssim_weight: float = 0.2
     """lambda of the colour loss: (1 - lambda) L1 + lambda (1 - SSIM)."""
     depth_weight: float = 1.0
@@ -99,6 +106,8 @@ class MappingConfig:
             "seed_spread": (self.seed_spread > 0.0, "expected more than 0"),
             "alpha_threshold": (0.0 < self.alpha_threshold <= 1.0, "expected 0 to 1"),
             "seeds_per_keyframe": (self.seeds_per_keyframe >= 1, "expected at least 1"),
+            "exposure_step": (self.exposure_step >= 0.0, "expected 0 or more"),
+            "max_keyframes": (self.max_keyframes >= 3, "expected at least 3"),
             "max_gaussians": (self.max_gaussians >= 1, "expected at least 1"),
         }
         found = [
@@ -125,4 +134,5 @@ def paper_schedule(config: MappingConfig) -> MappingConfig:
         depth_error_factor=40.0,
         prune_opacity=0.1,
         max_gaussians=_UNBOUNDED,
+        exposure_step=0.0,
     )

@@ -32,6 +32,15 @@ class Coverage:
         self._looks = np.pad(self._looks, (0, len(self._numbers) - len(self._looks)))
         self._views.append(np.array(numbers, np.intp))
 
+    def remove(self, view: int) -> None:
+        """Forget a view; those after it move up. Its cells keep their looks."""
+        del self._views[view]
+
+    def most_redundant(self, among: range) -> int:
+        """The view, of some, whose cells the most other views show too."""
+        shown = np.bincount(np.concatenate(self._views), minlength=len(self._looks))
+        return max(among, key=lambda view: _mean(shown[self._views[view]]))
+
     def look(self, view: int) -> None:
         """Note that a step was made on a view."""
         self._looks[self._views[view]] += 1.0
@@ -39,10 +48,13 @@ class Coverage:
     def neglect(self, view: int) -> float:
         """Mean over a view's cells of 1 / (1 + looks): 1 where nobody looked, near 0 where many
         did. A view without surface has 1."""
-        cells = self._views[view]
-        return float(np.mean(1.0 / (1.0 + self._looks[cells]))) if len(cells) else 1.0
+        return _mean(1.0 / (1.0 + self._looks[self._views[view]]))
 
     def _keys(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         cells = np.floor(np.asarray(points, np.float64) / self._side_m).astype(np.int64)
         cells = np.clip(cells + _REACH // 2, 0, _REACH - 1)
         return (cells[:, 0] * _REACH + cells[:, 1]) * _REACH + cells[:, 2]
+
+
+def _mean(values: NDArray[np.floating] | NDArray[np.intp]) -> float:
+    return float(np.mean(values)) if len(values) else 1.0

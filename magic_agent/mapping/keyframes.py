@@ -49,6 +49,16 @@ class Window:
         self._waits.append(1.0)
         self._coverage.add(points, depth_m=depth_m)
 
+    def make_room(self, most: int) -> int | None:
+        """Forget the keyframe that the others cover best when there are more than `most`; returns
+        its index. The first, the anchor, and the newest stay."""
+        if len(self._losses) <= most:
+            return None
+        index = self._coverage.most_redundant(range(1, len(self._losses) - 1))
+        del self._losses[index], self._waits[index]
+        self._coverage.remove(index)
+        return index
+
     def choose(self) -> int:
         """Index of the keyframe for the next step."""
         newest = len(self._losses) - 1

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.mapping.config import MappingConfig
+from magic_agent.mapping.exposure import Exposure, exposure_of
 from magic_agent.mapping.keyframes import Window, moved_enough
 from magic_agent.mapping.seeder import Seeder
 from magic_core.data import Frame
@@ -84,6 +85,7 @@ class Mapper:
         self._rng = np.random.default_rng(seed)
         self._seeder = Seeder(camera, self._config, self._rng)
         self._keyframes: list[Keyframe] = []
+        self._targets: list[Frame] = []
         self._median_depths: list[float] = []
         self._window = Window(self._config.newest_share, self._rng)
         self._optimiser: GaussianOptimiser | None = None
@@ -118,18 +120,13 @@ class Mapper:
         budget: MappingBudget = _UNBOUNDED,
     ) -> MappingReport:
         """Start a sub-map with this frame as anchor; carried Gaussians are in its frame."""
-        self._keyframes, self._median_depths = [], []
+        self._keyframes, self._targets, self._median_depths = [], [], []
         self._window = Window(self._config.newest_share, self._rng)
-        self._optimiser = GaussianOptimiser(
-            in_morton_order(carried) if carried is not None else GaussianCloud.empty(),
-            weights=LossWeights(
-                ssim=self._config.ssim_weight,
-                depth=self._config.depth_weight,
-                scale=self._config.regularisation_weight,
-            ),
-            learning_rates=LearningRates(means=self._config.means_rate_m),
-            threads=self._threads,
+        self._optimiser = self._new_optimiser(
+            in_morton_order(carried) if carried is not None else GaussianCloud.empty()
         )
+        if carried is not None:
+            self._expose_as(frame)
         return self.insert(frame, se3.identity(), budget=budget)
 
     @property
@@ -174,13 +171,22 @@ class Mapper:
     ) -> MappingReport:
         """Take a frame in as keyframe: seed, optimise, prune."""
         started = self._clock()
-        seeded = self._seed(frame, anchor_from_camera)
+        view = self.render(anchor_from_camera) if len(self) else None
+        original, frame = frame, self._in_the_maps_exposure(frame, view)
+        seeded = self._seed(frame, anchor_from_camera, view)
         self._keyframes.append(
-            Keyframe(frame.index, frame.timestamp_s, anchor_from_camera, frame.colour, frame.depth)
+            Keyframe(
+                frame.index, frame.timestamp_s, anchor_from_camera, original.colour, frame.depth
+            )
         )
+        self._targets.append(self._seeder.without_flying_pixels(frame))
         self._median_depths.append(_median_depth(frame))
         surface = self._surface(frame, anchor_from_camera)
         self._window.add(surface, depth_m=self._median_depths[-1])
+        forgotten = self._window.make_room(self._config.max_keyframes)
+        if forgotten is not None:
+            for kept in (self._keyframes, self._targets, self._median_depths):
+                del kept[forgotten]
         began = self._clock()
         iterations, cut, loss = self._optimise(budget, started)
         ended = self._clock()
@@ -200,12 +206,44 @@ class Mapper:
         kept = gaussians.select(visible).transformed(se3.inverse(anchor_from_next))
         return gaussians.select(~visible), kept
 
-    def _seed(self, frame: Frame, anchor_from_camera: Pose) -> int:
+    def _new_optimiser(self, gaussians: GaussianCloud) -> GaussianOptimiser:
+        return GaussianOptimiser(
+            gaussians,
+            weights=LossWeights(
+                ssim=self._config.ssim_weight,
+                depth=self._config.depth_weight,
+                scale=self._config.regularisation_weight,
+            ),
+            learning_rates=LearningRates(means=self._config.means_rate_m),
+            threads=self._threads,
+        )
+
+    def _exposure(self, frame: Frame, view: RenderedView | None) -> Exposure | None:
+        """The exposure of a frame against the sub-map, if it has jumped."""
+        if view is None or self._config.exposure_step <= 0.0:
+            return None
+        found = exposure_of(frame.colour, view.colour, view.alpha)
+        jumped = found is not None and found.difference > self._config.exposure_step
+        return found if jumped else None
+
+    def _in_the_maps_exposure(self, frame: Frame, view: RenderedView | None) -> Frame:
+        exposure = self._exposure(frame, view)
+        return frame if exposure is None else replace(frame, colour=exposure.removed(frame.colour))
+
+    def _expose_as(self, frame: Frame) -> None:
+        """Bring the carried Gaussians to the exposure of the new anchor."""
+        exposure = self._exposure(frame, self.render(se3.identity()))
+        if exposure is not None:
+            gaussians = self.gaussians()
+            self._optimiser = self._new_optimiser(
+                replace(gaussians, colours=exposure.applied(gaussians.colours))
+            )
+
+    def _seed(self, frame: Frame, anchor_from_camera: Pose, view: RenderedView | None) -> int:
         optimiser = self._active()
         room = self._config.max_gaussians - len(optimiser)
         if room <= 0:
             return 0
-        view = self.render(anchor_from_camera) if len(optimiser) else None
         seeds = self._seeder.seeds(
             frame, view, limit=room, existing=self._means_seen(view, anchor_from_camera)
         )
@@ -259,10 +297,8 @@ class Mapper:
 
     def _step(self, index: int) -> float:
         """One optimisation step on a keyframe; returns its loss before the step."""
-        keyframe = self._keyframes[index]
-        report = self._active().step(
-            self._camera, keyframe.anchor_from_camera, keyframe.colour, keyframe.depth
-        )
+        pose, target = self._keyframes[index].anchor_from_camera, self._targets[index]
+        report = self._active().step(self._camera, pose, target.colour, target.depth)
         self._window.report(index, report.loss)
         return report.loss
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,6 +47,13 @@ class Seeder:
             depth_floor=_NOISE_SHARE if adaptive else 0.0,
         )
         return need
+
+    def without_flying_pixels(self, frame: Frame) -> Frame:
+        """The frame as optimisation compares with it: readings that float over an edge removed."""
+        if self._config.seeding == "uniform":  # the paper believes every reading
+            return frame
+        reliable = surface_of(frame.depth, self._camera).reliable
+        return replace(frame, depth=np.where(reliable, frame.depth, np.float32(0.0)))
 
     def seeds(
         self,

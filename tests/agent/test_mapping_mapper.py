@@ -76,6 +76,21 @@ def test_size_of_a_sub_map_is_bounded():
     assert 0 < len(mapper) <= 700
 
 
+def test_images_kept_are_bounded_and_the_best_covered_makes_room():
+    mapper = begun(replace(CONFIG, iterations=2, anchor_iterations=2, max_keyframes=3))
+    elsewhere = se3.exp([0, 0, 0, 0, 1.2, 0])
+    for index, pose in ((1, elsewhere), (2, se3.exp([0.02, 0, 0, 0, 0, 0]))):
+        mapper.insert(frame_at(START @ pose, index), pose)
+    last = se3.exp([0, 0.02, 0, 0, 0, 0])
+    mapper.insert(frame_at(START @ last, 3), last)
+    # Frame 2 shows what the anchor and frame 3 show; nothing else shows what frame 1 does.
+    assert [keyframe.frame_index for keyframe in mapper.keyframes] == [0, 1, 3]
+    for _ in range(5):
+        mapper.insert(frame_at(START @ last, 4), last)
+    assert len(mapper.keyframes) == 3
+    assert mapper.keyframes[0].frame_index == 0
+
+
 def test_keyframes_follow_motion_and_keep_their_distance():
     mapper = begun(replace(CONFIG, keyframes=KeyframeConfig(novelty=1.0)))
     near = START @ se3.exp([0.01, 0, 0, 0, 0, 0])
@@ -124,6 +139,18 @@ def test_faded_and_oversized_gaussians_are_pruned():
     assert report.pruned >= 2
     behind = mapper.gaussians().means[:, 2] < -4.9
     assert behind.sum() == 1
+
+
+@pytest.mark.parametrize(("seeding", "floats"), [("adaptive", False), ("uniform", True)])
+def test_nothing_is_put_where_depth_floats_over_an_edge(seeding, floats):
+    depth = np.full((72, 96), 1.0, np.float32)
+    depth[:, 48:] = 2.0
+    depth[:, 47] = 1.4
+    colour = np.random.default_rng(0).integers(40, 200, (72, 96, 3), dtype=np.uint8)
+    mapper = Mapper(CAMERA, replace(CONFIG, seeding=seeding), threads=1)
+    mapper.begin(Frame(0, 0.0, colour, depth))
+    z = mapper.gaussians().means[:, 2]
+    assert bool(((z > 1.2) & (z < 1.8)).any()) is floats  # uniform is the paper's, which knows none
 
 
 def test_frame_without_depth_seeds_nothing_and_does_not_fail():
