@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -67,6 +68,7 @@ class Connection:
 
     def __init__(self, target: str, config: ClientConfig = ClientConfig()) -> None:
         self.target = target
+        self._closed = False
         self.config = config
         opened: Any = open_channel(target, config.credentials, client_options(config.transport))
         self._channel: grpc.aio.Channel = opened.channel
@@ -110,6 +112,7 @@ class Connection:
 
     async def close(self) -> None:
         """Close the connection; calls under way are cancelled."""
+        self._closed = True
         await self._channel.close(grace=None)
 
     async def idempotent(
@@ -131,10 +134,28 @@ class Connection:
         failures = 0
         while True:
             try:
-                return await attempt()
-            except grpc.RpcError as failure:
-                await self.pause_or_raise(error_of(failure), failures)
+                with self.own_errors():
+                    return await attempt()
+            except MagicError as error:
+                await self.pause_or_raise(error, failures)
             failures += 1
+
+    @contextlib.contextmanager
+    def own_errors(self) -> Iterator[None]:
+        """Raise our errors for those of gRPC.
+
+        When a connection breaks at a bad moment gRPC raises CancelledError, as if this task had
+        been cancelled; a task group around it would then end without a word.
+        """
+        try:
+            yield
+        except grpc.RpcError as failure:
+            raise error_of(failure) from failure
+        except asyncio.CancelledError as failure:
+            task = asyncio.current_task()
+            if self._closed or task is None or task.cancelling():
+                raise
+            raise Unavailable("the connection broke during the call") from failure
 
     async def pause_or_raise(self, error: MagicError, failures: int) -> None:
         """Sleep before the next attempt, or raise when trying again is no use.

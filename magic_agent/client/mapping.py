@@ -6,16 +6,14 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Any
 
-import grpc
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_agent.client.connection import Connection, new_id
-from magic_core.errors import DeadlineExceeded
+from magic_core.errors import DeadlineExceeded, MagicError
 from magic_core.geometry import Camera
 from magic_core.submap import Descriptor
 from magic_core.wire import (
     convert,
-    error_of,
     geometry,
     images,
     names,
@@ -127,12 +125,11 @@ class MappingCalls(Connection):
             timeout = self.config.watch_timeout_s
             call = self.mapping_stub.WatchCorrectedPoses(request, timeout=timeout)
             try:
-                async for answer in call:
+                async for answer in self._watched(call):
                     failures = 0
                     after_revision = answer.snapshot.revision
                     yield convert.snapshot_from_proto(answer.snapshot)
-            except grpc.RpcError as failure:
-                error = error_of(failure)
+            except MagicError as error:
                 if not isinstance(error, DeadlineExceeded):
                     await self.pause_or_raise(error, failures)
                     failures += 1
@@ -140,6 +137,16 @@ class MappingCalls(Connection):
                 await asyncio.sleep(self.config.backoff_s)
             finally:
                 call.cancel()
+
+    async def _watched(self, call: Any) -> AsyncIterator[mapping_pb.WatchCorrectedPosesResponse]:
+        """The answers of a call, with our errors."""
+        answers = aiter(call)
+        while True:
+            with self.own_errors():
+                answer = await anext(answers, None)
+            if answer is None:
+                return
+            yield answer
 
     async def get_trajectory(
         self, session: str, agent: str, *, wait_s: float = 30.0

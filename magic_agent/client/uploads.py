@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 
-import grpc
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_agent.client.connection import Connection
@@ -22,7 +21,6 @@ from magic_core.wire import (
     chunks_of,
     convert,
     encode_submap,
-    error_of,
     records,
 )
 
@@ -65,14 +63,15 @@ class UploadCalls(Connection):
         start = _BEGINNING
         while True:
             try:
-                if resume:
-                    start = await self._position(name, request_id)
-                    failures = 0 if start.durable_bytes > held else failures
-                    held = max(held, start.durable_bytes)
-                answer = await self._send(encoded, start)
+                with self.own_errors():
+                    if resume:
+                        start = await self._position(name, request_id)
+                        failures = 0 if start.durable_bytes > held else failures
+                        held = max(held, start.durable_bytes)
+                    answer = await self._send(encoded, start)
                 break
-            except grpc.RpcError as failure:
-                error = error_of(failure)
+            except MagicError as failure:
+                error = failure
             if _is_misplaced(error, start):  # dropped on the server since it was asked
                 resume, start = False, _BEGINNING
                 continue

@@ -18,7 +18,7 @@ import random
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, field
 
 from magic_agent.client import ClientConfig, MagicClient
@@ -139,28 +139,41 @@ async def _upload(address: str, submaps: list[EncodedSubmap], figures: Figures) 
     """One agent: it sends its sub-maps and waits out whatever the network does."""
     config = ClientConfig(
         connect_timeout_s=120.0,
-        rpc_timeout_s=30.0,
+        rpc_timeout_s=10.0,
         attempts=40,
         max_backoff_s=RETRY_S,
         transport=Transport(keepalive_s=KEEPALIVE_S, keepalive_timeout_s=KEEPALIVE_TIMEOUT_S),
     )
     session, name, _ = names.parse_submap(submaps[0].header.name)
     async with MagicClient(address, config) as client:
-        await client.register_agent(session, name, model_id=MODEL_ID, dimension=DIMENSION)
+        await _patiently(
+            lambda: client.register_agent(session, name, model_id=MODEL_ID, dimension=DIMENSION)
+        )
         for submap in submaps:
             await _submitted(client, submap)
             figures.acknowledged += 1
-        await client.finish_agent(session, name)
+        await _patiently(lambda: client.finish_agent(session, name))
 
 
 async def _submitted(client: MagicClient, submap: EncodedSubmap) -> None:
     resume = False
+
+    async def attempt() -> None:
+        nonlocal resume
+        again, resume = resume, True
+        await client.submit_encoded(submap, resume=again)
+
+    await _patiently(attempt)
+
+
+async def _patiently(attempt: Callable[[], Awaitable[object]]) -> None:
+    """Try until it works, as an agent does."""
     while True:
         try:
-            await client.submit_encoded(submap, resume=resume)
+            await attempt()
             return
         except (Unavailable, DeadlineExceeded):
-            resume = True
+            continue
 
 
 async def _check(address: str, recorded: list[list[EncodedSubmap]], figures: Figures) -> None:

@@ -97,6 +97,8 @@ class Proxy:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._pump(client, forth, link, counted=True))
                 group.create_task(self._pump(server, back, link, counted=False))
+        except* OSError:
+            pass  # one end is gone, and the other is sent away
         except* _Cut:
             traffic.cuts += 1
             if self._rng.random() < weather.silent:

@@ -42,6 +42,7 @@ def settings(folder: Path) -> dict:
     return {"data_dir": str(folder), "min_similarity": 0.3}
 
 
+@pytest.mark.slow
 async def test_a_loop_under_verification_is_verified_by_the_next_server(tmp_path: Path) -> None:
     async with ServerForge() as forge:
         server = await forge.start(settings(tmp_path))
@@ -62,6 +63,7 @@ async def test_a_loop_under_verification_is_verified_by_the_next_server(tmp_path
         await server.end()
 
 
+@pytest.mark.slow
 async def test_a_merge_goes_on_after_a_kill(tmp_path: Path) -> None:
     async with ServerForge() as forge:
         server = await forge.start(settings(tmp_path))

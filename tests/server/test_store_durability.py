@@ -174,6 +174,52 @@ async def test_a_blob_that_another_submap_holds_survives_a_failure(store: Store)
     assert set(store.blobs.names()) == kept
 
 
+async def test_a_commit_is_on_disk_before_it_returns(store: Store) -> None:
+    async with store._database.write() as connection:
+        assert (await connection.exec_driver_sql("PRAGMA synchronous")).scalar() == 2  # FULL
+        assert (await connection.exec_driver_sql("PRAGMA journal_mode")).scalar() == "wal"
+
+
+async def test_blobs_are_synced_and_named_before_the_transaction(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent = await registered(store)
+    events: list[str] = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+
+        def noted(*given, name=name, real=real):
+            events.append(name)
+            return real(*given)
+
+        monkeypatch.setattr(os, name, noted)
+    insert = store.submaps.insert
+
+    async def inserted(*given, **named):
+        events.append("transaction")
+        await insert(*given, **named)
+
+    monkeypatch.setattr(store.submaps, "insert", inserted)
+    made, blobs = new_submap(make_submap(), store)
+    await store.add_submap(agent, made, blobs, now=2.0)
+    # Every file, its name, the folders of the names; only then the database.
+    folders = {blob.sha256[0] for blob in blobs}
+    files = len(blobs)
+    expected = ["fsync"] * files + ["replace"] * files + ["fsync"] * len(folders)
+    assert events == [*expected, "transaction"]
+
+
+async def test_a_damaged_file_is_not_relied_on_and_is_replaced(store: Store) -> None:
+    agent, other = await registered(store), await registered(store, "agent_1")
+    made, blobs = new_submap(make_submap(), store)
+    await store.add_submap(agent, made, blobs, now=2.0)
+    path = store.blobs.path(made.digests[0])
+    path.write_bytes(path.read_bytes()[:-1])
+    again, blobs = new_submap(make_submap(), store)
+    await store.add_submap(other, again, blobs, now=3.0)
+    assert hashlib.sha256(store.blobs.read(made.digests[0])).hexdigest() == made.digests[0]
+
+
 async def test_a_folder_has_one_owner(store: Store) -> None:
     with ThreadPoolExecutor(1) as threads, pytest.raises(WrongState, match="another server"):
         await Store(store.folder, threads).open()
