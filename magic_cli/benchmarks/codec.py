@@ -1,21 +1,25 @@
-"""`magic bench codec DATASET`: bytes per sub-map, and what the compact codec costs in PSNR.
+"""`magic bench codec DATASET|RUN`: bytes per sub-map, and what the compact codec costs in PSNR.
 
-One agent maps the data; each sub-map is encoded losslessly and compactly, as it goes over the wire,
-and both are decoded and rendered at the sub-map's own keyframes.
+Of a dataset one agent maps some frames; each sub-map is encoded losslessly and compactly, as it
+goes over the wire, and both are decoded and rendered at the sub-map's own keyframes. Of a finished
+run the sub-maps' bytes are what its agents reported, and the merged map is encoded and rendered.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tyro.conf import Positional
 
+from magic_cli.benchmarks.stored import is_run_folder
 from magic_cli.options import parse
 from magic_cli.output import console, print_json, table
 from magic_core.errors import ConfigError
+from magic_core.evaluation import RunFolder
 
 if TYPE_CHECKING:
     from magic_core.data import FrameSource
@@ -30,7 +34,7 @@ class CodecBenchmark:
     """Options of `magic bench codec`."""
 
     dataset: Positional[str]
-    """Folder of a dataset."""
+    """Folder of a dataset, or of a run."""
     scale: float = 1.0
     """Process images at this fraction of their size."""
     frames: int = 150
@@ -54,6 +58,12 @@ def main(arguments: list[str]) -> int:
     config.validate()
     from magic_core.data import open_dataset
 
+    if is_run_folder(Path(config.dataset)):
+        result = _of_run(RunFolder(config.dataset), config.threads or None)
+        console.print(_run_table(result))
+        if config.json:
+            print_json(result)
+        return 0
     source = open_dataset(config.dataset, scale=config.scale, max_frames=config.frames)[0]
     rows = []
     with console.status("mapping") as status:
@@ -67,6 +77,60 @@ def main(arguments: list[str]) -> int:
     if config.json:
         print_json(result)
     return 0
+
+
+def _of_run(folder: RunFolder, threads: int | None) -> dict[str, Any]:
+    """Bytes that the agents reported, and the merged map before and after the codec."""
+    from magic_cli.benchmarks.merge import judge_of
+    from magic_cli.benchmarks.stored import stored_sources
+    from magic_core.evaluation.image_metrics import psnr
+    from magic_core.gaussians import codec
+    from magic_core.render import Rasteriser
+
+    cloud, rasteriser = folder.read_map(), Rasteriser(threads)
+    packed = codec.encode_compact(cloud)
+    clouds = {"lossless": cloud, "compact": codec.decode(packed)}
+    judge = judge_of(folder, 24, stored_sources(folder))
+    shown = {
+        f"{kind}_{name}_db": float(np.mean([
+            psnr(rasteriser.render(chosen, v.camera, v.world_from_camera).colour, v.colour / 255.0)
+            for v in views
+        ]))
+        for kind, views in (("train", judge.train), ("novel", judge.novel))
+        for name, chosen in clouds.items()
+    }  # fmt: skip
+    sizes = [
+        size
+        for agent in folder.agents()
+        if folder.agent_report_path(agent).is_file()
+        for size in folder.read_agent_report(agent).wire_bytes
+    ]
+    return {
+        "submaps": len(sizes),
+        "compact_bytes": float(np.mean([size.compact for size in sizes])),
+        "lossless_bytes": float(np.mean([size.lossless for size in sizes])),
+        "gaussians": len(cloud),
+        "map_compact_bytes": len(packed),
+        "map_lossless_bytes": len(codec.encode_lossless(cloud)),
+        **shown,
+        "cost_db": {
+            kind: shown[f"{kind}_lossless_db"] - shown[f"{kind}_compact_db"]
+            for kind in ("train", "novel")
+        },
+    }
+
+
+def _run_table(result: dict[str, Any]):
+    rows = [
+        ["lossless", f"{result['lossless_bytes'] / 1e6:.2f} MB",
+         f"{result['map_lossless_bytes'] / 1e6:.2f} MB", f"{result['train_lossless_db']:.3f} dB",
+         f"{result['novel_lossless_db']:.3f} dB"],
+        ["compact", f"{result['compact_bytes'] / 1e6:.2f} MB",
+         f"{result['map_compact_bytes'] / 1e6:.2f} MB", f"{result['train_compact_db']:.3f} dB",
+         f"{result['novel_compact_db']:.3f} dB"],
+    ]  # fmt: skip
+    title = f"{result['submaps']} sub-maps and their map of {result['gaussians']:,} Gaussians"
+    return table(title, ["", "per sub-map", "map", "keyframes", "new views"], rows)
 
 
 def _submaps(source: FrameSource, config: CodecBenchmark) -> Iterator[Submap]:

@@ -80,7 +80,7 @@ def _measured(folder: RunFolder, config: MergeBenchmark) -> dict[str, Any]:
     result: dict[str, Any] = {"submaps": len(sources)}
     with console.status("merging") as status:
         if config.speed:
-            judge = _judge(folder, config.views, sources)
+            judge = judge_of(folder, config.views, sources)
             paper = benchmark.paper_scheme(
                 sources, judge, config.merge, iterations=config.iterations, said=status.update
             )
@@ -99,7 +99,7 @@ def _measured(folder: RunFolder, config: MergeBenchmark) -> dict[str, Any]:
     return result
 
 
-def _judge(folder: RunFolder, count: int, sources: Any) -> Any:
+def judge_of(folder: RunFolder, count: int, sources: Any) -> Any:
     """Real frames of the run's data, and keyframes as they are stored."""
     import numpy as np
 
