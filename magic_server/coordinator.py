@@ -26,7 +26,7 @@ from magic_server.config import ServerConfig
 from magic_server.graph import SessionGraph
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import verify_loop
-from magic_server.loops import SubmapKey, select_candidates
+from magic_server.loops import LoopCandidate, SubmapKey, left_over, select_candidates
 from magic_server.metrics import Metrics
 from magic_server.places import DescriptorIndex
 from magic_server.poseboard import PoseBoard
@@ -271,6 +271,7 @@ class SessionCoordinator:
             model_id=self.session.model_id,
             is_known_pair=self.graph.knows_pair,
         )
+        chosen += await self._chosen_by_older(vertex, hits, chosen)
         found = [
             records.LoopCandidate(c.query.name, c.hit.name, c.similarity, "PENDING", "PENDING")
             for c in chosen
@@ -281,6 +282,31 @@ class SessionCoordinator:
         self._pending.extend(found)
         logger.info("%s: %d loop candidates", vertex.name, len(found))
         self._notify()
+
+    async def _chosen_by_older(
+        self, vertex: Vertex, hits: list[tuple[str, float]], chosen: list[LoopCandidate]
+    ) -> list[LoopCandidate]:
+        """Older sub-maps that would choose the new one, where it had no room for them."""
+        config, model_id = self._config.loops, self.session.model_id
+        keys = [(_key(name), similarity) for name, similarity in hits]
+        query = _key(vertex.name)
+        found = []
+        for candidate in left_over(
+            query, keys, chosen, config, model_id=model_id, is_known_pair=self.graph.knows_pair
+        ):
+            vector = self.graph.descriptor_of(candidate.hit.name)
+            async with self._index_lock:
+                count = config.top_k * QUERY_MARGIN
+                around = await self._in_thread(self._index.query, vector, count)
+            would = select_candidates(
+                candidate.hit,
+                [(_key(name), similarity) for name, similarity in around],
+                config,
+                model_id=model_id,
+            )
+            if query in [other.hit for other in would]:
+                found.append(candidate)
+        return found
 
     # Verification: which of them are the same place
 

@@ -62,6 +62,10 @@ class SessionGraph:
         """The sub-maps of an agent, all by resource name."""
         return {vertex.name for vertex in self._vertices.values() if vertex.agent == agent}
 
+    def descriptor_of(self, submap: str) -> np.ndarray:
+        """The anchor's descriptor (d,) of a sub-map by resource name."""
+        return self._vertices[submap].descriptor.vector
+
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
         self._vertices[vertex.name] = vertex

@@ -39,6 +39,9 @@ class LoopConfig:
     """At most this many candidates for one query."""
     top_k_per_agent: int = 4
     """At most this many with one other agent, so that a slow agent cannot take all places."""
+    ask_older: int = 6
+    """So many similar sub-maps that a new one has no room for are asked whether they have room for
+    it: an older one may have fewer places like it. 0 for none."""
     min_index_gap: int = 2
     """Within an agent, sub-maps nearer in sequence are not loops: odometry links them already."""
     min_neighbour_gap: int = 1
@@ -48,6 +51,8 @@ class LoopConfig:
         for name in ("top_k", "top_k_per_agent", "min_index_gap", "min_neighbour_gap"):
             if getattr(self, name) < 1:
                 raise ConfigError.field(f"loops.{name}", f"{getattr(self, name)}: expected >= 1")
+        if self.ask_older < 0:
+            raise ConfigError.field("loops.ask_older", f"{self.ask_older}: expected >= 0")
         if self.min_similarity is not None and not -1.0 <= self.min_similarity <= 1.0:
             raise ConfigError.field(
                 "loops.min_similarity", f"{self.min_similarity}: expected -1 to 1"
@@ -97,6 +102,30 @@ def select_candidates(
         if _is_diverse(hit, chosen, config):
             chosen.append(LoopCandidate(query=query, hit=hit, similarity=similarity))
     return chosen
+
+
+def left_over(
+    query: SubmapKey,
+    hits: Sequence[tuple[SubmapKey, float]],
+    chosen: Sequence[LoopCandidate],
+    config: LoopConfig,
+    *,
+    model_id: str = "",
+    is_known_pair: Callable[[str, str], bool] = lambda query, hit: False,
+) -> list[LoopCandidate]:
+    """The most similar hits that `select_candidates` had no room for; those ends may have some."""
+    if not config.enabled:
+        return []
+    taken = {candidate.hit.name for candidate in chosen}
+    rest = [
+        LoopCandidate(query, hit, similarity)
+        for hit, similarity in sorted(hits, key=lambda item: (-item[1], item[0].name))
+        if similarity >= config.threshold(model_id)
+        and hit.name not in taken
+        and not _is_neighbour(query, hit, config)
+        and not is_known_pair(query.name, hit.name)
+    ]
+    return rest[: config.ask_older]
 
 
 def _is_neighbour(query: SubmapKey, hit: SubmapKey, config: LoopConfig) -> bool:

@@ -77,6 +77,11 @@ def _detection(result: dict):
         for name, found in result["detection"].items()
         for point in found["curve"]
     ]  # fmt: skip
+    for name, found in result["detection"].items():
+        if best := found["calibrated"]:
+            rows.append([f"{name}, calibrated", f"{best['threshold']:.3f}",
+                         _share(best["precision"]), _share(best["recall"]),
+                         str(best["candidates"])])  # fmt: skip
     columns = ["encoder", "similarity from", "precision", "recall", "candidates"]
     return table("Detection by descriptor", columns, rows)
 

@@ -29,6 +29,8 @@ Describe = Callable[[NDArray[np.uint8]], Descriptor]
 OVERLAP_BINS = ((0.3, 0.5), (0.5, 0.7), (0.7, 1.01))
 LOOP_OVERLAP = 0.3
 """Pairs that overlap by this much are what detection should find."""
+WANTED_RECALL = 0.95
+"""What a calibrated threshold of similarity finds of these."""
 STRIDE = 3
 SEEDED_SHARE = 0.25
 """Gaussians per pixel of the method `means`."""
@@ -193,7 +195,32 @@ def detection(
                 "candidates": int(chosen.sum()),
             }
         )
-    return {"curve": curve, "pairs": len(index), "loops": int(is_loop.sum())}
+    return {
+        "curve": curve,
+        "calibrated": calibrated(similarity, is_loop),
+        "pairs": len(index),
+        "loops": int(is_loop.sum()),
+    }
+
+
+def calibrated(
+    similarity: NDArray[np.float64], is_loop: NDArray[np.bool_], *, recall: float = WANTED_RECALL
+) -> dict[str, float] | None:
+    """The largest threshold that finds `recall` of the loops; None where there are none.
+
+    Registration refuses the wrong ones later, so that recall comes first.
+    """
+    loops = np.sort(similarity[is_loop])[::-1]
+    if not len(loops):
+        return None
+    threshold = float(loops[int(np.ceil(recall * len(loops))) - 1])
+    chosen = similarity >= threshold
+    return {
+        "threshold": threshold,
+        "recall": float(chosen[is_loop].mean()),
+        "precision": float(is_loop[chosen].mean()),
+        "candidates": int(chosen.sum()),
+    }
 
 
 def _row(

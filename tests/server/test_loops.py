@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magic_core.errors import ConfigError
-from magic_server.loops import LoopConfig, SubmapKey, select_candidates
+from magic_server.loops import LoopConfig, SubmapKey, left_over, select_candidates
 
 
 def key(agent: str, index: int) -> SubmapKey:
@@ -49,6 +49,20 @@ def test_pairs_tried_before_are_left_out():
         is_known_pair=lambda query, hit: hit == "b/0",
     )
     assert names(chosen) == ["b/1"]
+
+
+def test_hits_without_room_are_left_for_the_other_end_to_choose():
+    hits = [(key("b", i), 0.9 - 0.01 * i) for i in range(5)] + [
+        (key("a", 1), 0.89), (key("c", 0), 0.4)
+    ]  # fmt: skip
+    config = LoopConfig(min_similarity=0.5, top_k_per_agent=2, ask_older=2)
+    chosen = select_candidates(key("a", 0), hits, config)
+    assert names(chosen) == ["b/0", "b/1"]
+    rest = left_over(
+        key("a", 0), hits, chosen, config, is_known_pair=lambda query, hit: hit == "b/2"
+    )
+    assert names(rest) == ["b/3", "b/4"]
+    assert not left_over(key("a", 0), hits, chosen, LoopConfig(ask_older=0, min_similarity=0.5))
 
 
 def test_threshold_follows_the_encoder():

@@ -11,7 +11,7 @@ import pytest
 from magic_core.errors import ConfigError
 from magic_core.geometry import se3
 from magic_server.registration import AnchorView, RegistrationConfig, prepare
-from magic_server.registration.benchmark import Anchor, load_anchors, run, true_overlap
+from magic_server.registration.benchmark import Anchor, calibrated, load_anchors, run, true_overlap
 from magic_server.registration.refine import FramePair, Pyramids, refine
 from magic_server.registration.register import loop_information, register
 from magic_server.registration.verify import figures_of
@@ -173,6 +173,15 @@ def test_information_is_bounded_by_the_systematic_error():
 def test_refuses_unknown_methods():
     with pytest.raises(ConfigError, match="methods"):
         RegistrationConfig(methods=("guess",))  # type: ignore[arg-type]
+
+
+def test_a_calibrated_threshold_is_the_largest_that_finds_enough():
+    similarity = np.array([0.9, 0.8, 0.7, 0.6, 0.5, 0.4])
+    is_loop = np.array([True, True, False, True, False, True])
+    found = calibrated(similarity, is_loop, recall=0.75)
+    assert found is not None
+    assert (found["threshold"], found["recall"], found["precision"]) == (0.6, 0.75, 0.75)
+    assert calibrated(similarity, np.zeros(6, bool)) is None
 
 
 def test_true_overlap_is_symmetric_and_zero_across_datasets(room):
