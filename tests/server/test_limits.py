@@ -28,7 +28,7 @@ from magic_core.errors import (
     ResourceExhausted,
     Unavailable,
 )
-from magic_core.wire import encode_submap
+from magic_core.wire import encode_submap, grpc_status_of
 from magic_server.config import ServerConfig, ServiceLimits
 from magic_server.drain import Gate
 from magic_server.loops import LoopConfig
@@ -89,18 +89,42 @@ def test_buckets_do_not_grow_without_end(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(rates._buckets) == 10
 
 
-async def test_the_client_waits_as_long_as_the_server_asks(server_config: ServerConfig) -> None:
-    config = with_quotas(server_config, agent_submaps_per_minute=120.0, burst_s=0.5)
+async def test_a_rate_refuses_says_how_long_and_admits_after_that(
+    server_config: ServerConfig,
+) -> None:
+    config = with_quotas(server_config, agent_submaps_per_minute=0.1, burst_s=1.0)
     async with serving(config) as (server, client):
         await register(client)
         await client.submit_submap(make_submap(index=0))
         with pytest.raises(RateLimited) as caught:
             await client.submit_submap(make_submap(index=1))
-        assert caught.value.retry_after_s is not None
-        assert 0.0 < caught.value.retry_after_s <= 0.5
-        async with MagicClient(server.address, ClientConfig(backoff_s=0.001)) as patient:
-            receipt = await patient.submit_submap(make_submap(index=1))
-        assert not receipt.duplicate
+        asked_s = caught.value.retry_after_s
+        assert asked_s is not None
+        assert 500.0 < asked_s <= 600.0
+        now = server.quotas._rates._clock()
+        server.quotas._rates._clock = lambda: now + asked_s
+        assert not (await client.submit_submap(make_submap(index=1))).duplicate
+
+
+async def test_the_client_waits_as_long_as_the_server_asks(server: Server) -> None:
+    async with MagicClient(server.address, ClientConfig(backoff_s=0.001)) as client:
+        refusals = [RateLimited("slow down", retry_after_s=0.2)] * 2
+        loop = asyncio.get_running_loop()
+        started = loop.time()
+
+        async def attempt() -> str:
+            if refusals:
+                status = grpc_status_of(refusals.pop())
+                raise grpc.aio.AioRpcError(
+                    status.code,
+                    grpc.aio.Metadata(),
+                    grpc.aio.Metadata(*status.trailing_metadata),
+                    details=status.details,
+                )
+            return "admitted"
+
+        assert await client.retried(attempt) == "admitted"
+        assert loop.time() - started >= 0.4
 
 
 async def test_a_longer_wait_than_the_client_allows_is_an_error_at_once(
