@@ -6,7 +6,7 @@ magic bench map DATASET                    rendering of sub-maps, our schedule a
 magic bench agent DATASET --threads N      frames per second of one whole agent
 magic bench loops DATASET...               precision and recall of loop detection and verification
 magic bench merge RUN|DATASET              fine merging against the paper's scheme, and its memory
-magic bench codec DATASET                  bytes per sub-map, and what the compact codec costs
+magic bench codec DATASET|RUN              bytes per sub-map, and what the compact codec costs
 magic bench ablations DATASET              the paper's tables with our rows, each part left out
 magic bench server                         many agents at once: rate, latencies, memory, event loop
 """
