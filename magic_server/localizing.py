@@ -159,7 +159,7 @@ def _checked(
         depth_png=request.depth_png,
         metres_per_unit=request.metres_per_unit,
     )
-    return image, geometry.descriptor_from_proto(request.descriptor)
+    return image, geometry.descriptor_from_proto(request.image_descriptor)
 
 
 def _check_fields(
@@ -180,5 +180,5 @@ def _check_fields(
             "metres_per_unit", f"{request.metres_per_unit}, expected a finite number > 0"
         )
     longest = config.limits.submap.max_descriptor_dimension
-    if problem := geometry.descriptor_problem(request.descriptor, max_dimension=longest):
-        raise InvalidInput.field("descriptor", problem)
+    if problem := geometry.descriptor_problem(request.image_descriptor, max_dimension=longest):
+        raise InvalidInput.field("image_descriptor", problem)

@@ -170,8 +170,8 @@ class SubmapReceiver:
                 f"request {header.request_id!r} stored "
                 f"{names.submap_name(session, agent.name, other)}; each sub-map has its own id"
             )
-        vector = header.descriptor.vector
-        require_model(agent.session, header.descriptor.model_id, len(vector))
+        vector = header.image_descriptor.vector
+        require_model(agent.session, header.image_descriptor.model_id, len(vector))
         if header.HasField("odometry"):
             previous = header.odometry.previous_index
             if await self._store.submaps.first_answer(agent, previous) is None:
@@ -339,7 +339,7 @@ class Upload:
             name=self.header.name,
             agent=names.agent_name(session, agent),
             index=index,
-            descriptor=geometry.descriptor_from_proto(self.header.descriptor),
+            descriptor=geometry.descriptor_from_proto(self.header.image_descriptor),
             odometry=decode_odometry(self.header),
             prior=prior,
             searched=False,

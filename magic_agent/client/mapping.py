@@ -82,7 +82,7 @@ class MappingCalls(Connection):
         if isinstance(query, str):
             request.submap = query
         else:
-            request.descriptor.CopyFrom(geometry.descriptor_to_proto(query))
+            request.image_descriptor.CopyFrom(geometry.descriptor_to_proto(query))
         answer = await self.idempotent(self.mapping_stub.QueryLoops, request)
         candidates = tuple(convert.loop_from_proto(c) for c in answer.candidates)
         return records.LoopAnswer(candidates, answer.revision)
@@ -182,7 +182,7 @@ class MappingCalls(Connection):
             colour_media_type=images.JPEG,
             depth_png=await asyncio.to_thread(images.encode_depth_png, depth),
             metres_per_unit=0.001,
-            descriptor=geometry.descriptor_to_proto(descriptor),
+            image_descriptor=geometry.descriptor_to_proto(descriptor),
         )
         answer = await self.idempotent(
             self.mapping_stub.Localize, request, timeout_s=self.config.localize_timeout_s

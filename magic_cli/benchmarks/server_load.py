@@ -108,7 +108,7 @@ async def _submit(
 async def _ask(address: str, recording: Recording, load: Load) -> None:
     """What readers ask: all poses, the loops of a sub-map, the places like an image."""
     header = recording.walks[0][0].encoded.header
-    descriptor: Descriptor = geometry.descriptor_from_proto(header.descriptor)
+    descriptor: Descriptor = geometry.descriptor_from_proto(header.image_descriptor)
     oldest = names.submap_name(SESSION, "load_0", 0)
     async with MagicClient(address, ClientConfig(rpc_timeout_s=120.0)) as client:
         await load.begun.wait()

@@ -142,6 +142,38 @@ def decode(data: bytes, *, max_gaussians: int = MAX_GAUSSIANS) -> GaussianCloud:
     return cloud
 
 
+def check(data: bytes, *, max_gaussians: int = MAX_GAUSSIANS) -> int:
+    """The number of Gaussians in a blob; raises where `decode` would, in a fifth of its time.
+
+    What the compact layout can say wrong shows in its extremes: rotations and opacities of any code
+    are right ones, positions, scales and colours grow with their codes.
+    """
+    layout, count = _read_header(data)
+    if layout == LOSSLESS or not 0 < count <= max_gaussians:
+        return len(decode(data, max_gaussians=max_gaussians))
+    payload = _unpack(data, _RANGES.size + count * COMPACT_BYTES)
+    ranges = _read_ranges(payload)
+    raw = np.frombuffer(payload, np.uint8, offset=_RANGES.size)
+    grid = np.cumsum(_unzigzag(_from_planes(raw[: 12 * count], (3, count))), axis=1)
+    corners = np.stack([grid.min(axis=1), grid.max(axis=1)])
+    scales, colours = raw[16 * count : 19 * count], raw[20 * count :]
+    with np.errstate(over="ignore"):
+        extremes = GaussianCloud.from_arrays(
+            corners * ranges.step + np.array(ranges.origin),
+            np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+            scales=np.exp(_from_bytes(_extremes(scales), ranges.scale)),
+            opacities=np.full(2, 0.5),
+            colours=_from_bytes(_extremes(colours), ranges.colour),
+        )
+        extremes.validate()
+    return count
+
+
+def _extremes(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Lowest and highest code, (2, 3)."""
+    return np.repeat(np.array([codes.min(), codes.max()])[:, None], 3, axis=1)
+
+
 def gaussian_count(data: bytes) -> int:
     """The number of Gaussians that the header claims; reads the first 12 bytes only."""
     return _read_header(data)[1]
@@ -197,24 +229,39 @@ def _decode_lossless(payload: bytes, count: int) -> GaussianCloud:
     return GaussianCloud(*(p.reshape(shape) for p, shape in zip(parts, shapes, strict=True)))
 
 
-def _decode_compact(payload: bytes, count: int) -> GaussianCloud:
+@dataclass(frozen=True, slots=True)
+class _Ranges:
+    """What the codes of a compact blob mean."""
+
+    origin: tuple[float, float, float]
+    step: float
+    scale: tuple[float, float]
+    colour: tuple[float, float]
+
+
+def _read_ranges(payload: bytes) -> _Ranges:
     ox, oy, oz, step, scale_lo, scale_hi, colour_lo, colour_hi = _RANGES.unpack_from(payload)
     if not np.isfinite([ox, oy, oz, step, scale_lo, scale_hi, colour_lo, colour_hi]).all():
         raise InvalidInput.field("gaussians.ranges", "holds NaN or infinity")
+    return _Ranges((ox, oy, oz), step, (scale_lo, scale_hi), (colour_lo, colour_hi))
+
+
+def _decode_compact(payload: bytes, count: int) -> GaussianCloud:
+    ranges = _read_ranges(payload)
     raw = np.frombuffer(payload, np.uint8, offset=_RANGES.size)
     deltas, raw = raw[: 12 * count], raw[12 * count :]
     codes, raw = raw[: 4 * count], raw[4 * count :]
     scales, raw = raw[: 3 * count], raw[3 * count :]
     opacities, colours = raw[:count], raw[count:]
     grid = np.cumsum(_unzigzag(_from_planes(deltas, (3, count))), axis=1, dtype=np.int64)
-    means = grid.T * step + np.array([ox, oy, oz])
+    means = grid.T * ranges.step + np.array(ranges.origin)
     with np.errstate(over="ignore"):
         return GaussianCloud.from_arrays(
             means,
             _quaternions_of_codes(_from_planes(codes, (count,))),
-            scales=np.exp(_from_bytes(scales.reshape(3, count).T, (scale_lo, scale_hi))),
+            scales=np.exp(_from_bytes(scales.reshape(3, count).T, ranges.scale)),
             opacities=(opacities.astype(np.float64) + 0.5) / 256.0,
-            colours=_from_bytes(colours.reshape(3, count).T, (colour_lo, colour_hi)),
+            colours=_from_bytes(colours.reshape(3, count).T, ranges.colour),
         )
 
 

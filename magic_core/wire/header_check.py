@@ -87,8 +87,8 @@ def _violations(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> Iterat
     yield from _keyframe_violations(header)
     yield from _odometry_violations(header)
     dimension = limits.max_descriptor_dimension
-    if problem := geometry.descriptor_problem(header.descriptor, max_dimension=dimension):
-        yield FieldViolation("descriptor", problem)
+    if problem := geometry.descriptor_problem(header.image_descriptor, max_dimension=dimension):
+        yield FieldViolation("image_descriptor", problem)
     if header.HasField("world_from_anchor_prior"):
         row = geometry.pose_row(header.world_from_anchor_prior)
         if problem := geometry.pose_problems(row[None])[0]:

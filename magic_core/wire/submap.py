@@ -62,7 +62,7 @@ def encode_submap(
         request_id=request_id,
         camera=geometry.camera_to_proto(submap.camera),
         trajectory=[_frame_to_proto(frame) for frame in submap.trajectory],
-        descriptor=geometry.descriptor_to_proto(submap.descriptor),
+        image_descriptor=geometry.descriptor_to_proto(submap.descriptor),
         odometry=None if submap.odometry is None else _odometry_to_proto(submap.odometry),
         gaussians_blob=blobs.add(gaussians, submap_pb2.BLOB_ROLE_GAUSSIANS, GAUSSIANS_MEDIA_TYPE),
     )
@@ -104,7 +104,7 @@ def decode_submap(header: submap_pb2.SubmapHeader, blobs: Sequence[bytes]) -> Su
         gaussians=codec.decode(blobs[header.gaussians_blob]),
         keyframes=tuple(keyframes),
         trajectory=decode_trajectory(header),
-        descriptor=geometry.descriptor_from_proto(header.descriptor),
+        descriptor=geometry.descriptor_from_proto(header.image_descriptor),
         odometry=decode_odometry(header),
         world_from_anchor_prior=prior,
     )
@@ -140,7 +140,7 @@ def check_blob(header: submap_pb2.SubmapHeader, index: int, data: bytes) -> int:
     info = header.blobs[index]
     try:
         if info.role == submap_pb2.BLOB_ROLE_GAUSSIANS:
-            return len(codec.decode(data))
+            return codec.check(data)
         size = (header.camera.width, header.camera.height)
         depth = info.role == submap_pb2.BLOB_ROLE_DEPTH
         images.check_image(data, info.media_type, size=size, depth=depth)

@@ -118,7 +118,7 @@ def _submap(
     check_header(header, limits)
     _check_time(entry.received_at)
     _, agent, index = names.parse_submap(header.name)
-    require_model(session, header.descriptor.model_id, len(header.descriptor.vector))
+    require_model(session, header.image_descriptor.model_id, len(header.image_descriptor.vector))
     if header.HasField("odometry"):
         previous = (agent, header.odometry.previous_index)
         _require(previous in numbers, "odometry.previous_index", "is not in the archive")
@@ -130,7 +130,7 @@ def _submap(
         name=header.name,
         agent=names.agent_name(session.name, agent),
         index=index,
-        descriptor=geometry.descriptor_from_proto(header.descriptor),
+        descriptor=geometry.descriptor_from_proto(header.image_descriptor),
         odometry=decode_odometry(header),
         prior=prior,
         searched=entry.searched,

@@ -123,10 +123,10 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         match request.WhichOneof("query"):
             case "submap":
                 candidates, coordinator = await self._recorded(request)
-            case "descriptor":
+            case "image_descriptor":
                 candidates, coordinator = await self._nearest(request)
             case _:
-                raise InvalidInput.field("query", "give `submap` or `descriptor`")
+                raise InvalidInput.field("query", "give `submap` or `image_descriptor`")
         return mapping_pb.QueryLoopsResponse(
             candidates=await self._loop_messages(candidates), revision=coordinator.board.revision
         )
@@ -225,10 +225,10 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
     ) -> tuple[list[records.LoopCandidate], SessionCoordinator]:
         coordinator = await self._coordinator(request.session)
         limit = self._config.limits.submap.max_descriptor_dimension
-        if problem := geometry.descriptor_problem(request.descriptor, max_dimension=limit):
-            raise InvalidInput.field("descriptor", problem)
-        vector = np.array(request.descriptor.vector, dtype=np.float32)
-        require_model(coordinator.session, request.descriptor.model_id, len(vector))
+        if problem := geometry.descriptor_problem(request.image_descriptor, max_dimension=limit):
+            raise InvalidInput.field("image_descriptor", problem)
+        vector = np.array(request.image_descriptor.vector, dtype=np.float32)
+        require_model(coordinator.session, request.image_descriptor.model_id, len(vector))
         found = await coordinator.nearest(
             vector,
             count=request.max_candidates or 10,

@@ -144,7 +144,7 @@ BROKEN = {
     "keyframes[1].frame_index": lambda h: setattr(h.keyframes[1], "frame_index", 99),
     "keyframes[1].colour_blob": lambda h: setattr(h.keyframes[1], "colour_blob", 77),
     "keyframes[1].depth_blob": lambda h: setattr(h.keyframes[1], "depth_blob", 0),
-    "descriptor": lambda h: h.descriptor.vector.append(0.5),
+    "image_descriptor": lambda h: h.image_descriptor.vector.append(0.5),
     "odometry.previous_index": lambda h: setattr(h.odometry, "previous_index", 1),
     "odometry.previous_from_anchor": lambda h: h.odometry.ClearField("previous_from_anchor"),
     "odometry.information": lambda h: h.odometry.information.pop(),

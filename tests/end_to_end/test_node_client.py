@@ -12,7 +12,10 @@ import pytest
 
 from magic_agent.client import MagicClient
 from magic_server.server import Server
+from tests.end_to_end.client_files import blobs_of, spoil, write_submap
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, make_submap
+
+pytestmark = pytest.mark.slow
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "clients" / "node"
 
@@ -47,6 +50,21 @@ async def ask(server: Server, *arguments: str) -> tuple[int, dict]:
     """Exit code and answer of the example client."""
     code, output = await run("node", "client.js", server.address, *arguments)
     return code, json.loads(output)
+
+
+async def test_node_submits_submaps(server: Server, client: MagicClient, tmp_path: Path) -> None:
+    await install()
+    files = write_submap(tmp_path / "agent_0", agent=0)
+    code, answer = await ask(server, "submit", *files)
+    assert (code, answer.get("duplicate")) == (0, False), answer
+    assert answer["submap"] == "sessions/room/agents/agent_0/submaps/0"
+    stored = await client.download_encoded(answer["submap"])
+    assert list(stored.blobs) == blobs_of(files)
+    assert (await ask(server, "submit", *files))[1]["duplicate"]
+    spoil(files)
+    code, answer = await ask(server, "submit", *files)
+    assert (code, answer["error"]["code"]) == (1, "DATA_LOSS")
+    assert len(await client.list_submaps("room")) == 1
 
 
 async def test_node_reads_corrected_poses_and_loops(server: Server, client: MagicClient) -> None:

@@ -199,7 +199,7 @@ def bomb_request(width: int, height: int) -> mapping_pb.LocalizeRequest:
         colour_media_type=images.PNG,
         depth_png=bomb_png(width, height, depth=True),
         metres_per_unit=0.001,
-        descriptor=geometry.descriptor_to_proto(submap.descriptor),
+        image_descriptor=geometry.descriptor_to_proto(submap.descriptor),
     )
 
 

@@ -133,7 +133,7 @@ def _use(header: submap_pb2.SubmapHeader) -> None:
     """What the server does with a header before a byte of its blobs has come."""
     check_header(header, LIMITS)
     header.SerializeToString(deterministic=True)
-    geometry.descriptor_from_proto(header.descriptor)
+    geometry.descriptor_from_proto(header.image_descriptor)
     decode_odometry(header)
 
 

@@ -163,8 +163,8 @@ def _right_request(request: Message, material: Material) -> Message:
     for field in request.DESCRIPTOR.fields:
         if field.name in values and not field.containing_oneof:
             setattr(request, field.name, values[field.name])
-        elif field.name == "descriptor":
-            request.descriptor.CopyFrom(header.descriptor)  # type: ignore[attr-defined]
+        elif field.name == "image_descriptor":
+            request.image_descriptor.CopyFrom(header.image_descriptor)  # type: ignore[attr-defined]
         elif field.name == "camera":
             request.camera.CopyFrom(header.camera)  # type: ignore[attr-defined]
     return request

@@ -56,7 +56,7 @@ async def mapped(
         await client.register_agent("empty", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
     async with (
         Server(config) as second,
-        MagicClient(second.address, ClientConfig(rpc_timeout_s=60.0)) as client,
+        MagicClient(second.address, ClientConfig(localize_timeout_s=240.0)) as client,
     ):
         assert await (await second.sessions.named("room")).idle(timeout_s=60)
         yield second, client
@@ -121,7 +121,7 @@ def request() -> mapping_pb.LocalizeRequest:
         colour_media_type=images.JPEG,
         depth_png=images.encode_depth_png(depth),
         metres_per_unit=0.001,
-        descriptor=geometry.descriptor_to_proto(thumbnail(colour)),
+        image_descriptor=geometry.descriptor_to_proto(thumbnail(colour)),
     )
 
 
@@ -143,7 +143,7 @@ MALFORMED: dict[str, tuple[Callable[[mapping_pb.LocalizeRequest], object], type,
     "no unit": (lambda r: r.ClearField("metres_per_unit"), InvalidInput, "metres_per_unit"),
     "NaN unit": (
         lambda r: setattr(r, "metres_per_unit", float("nan")), InvalidInput, "metres_per_unit"),
-    "no descriptor": (lambda r: r.ClearField("descriptor"), InvalidInput, "descriptor"),
+    "no descriptor": (lambda r: r.ClearField("image_descriptor"), InvalidInput, "image_descriptor"),
 }  # fmt: skip
 
 

@@ -169,7 +169,7 @@ async def test_a_descriptor_of_another_model_is_refused(
     registered: MagicClient, server: Server
 ) -> None:
     bad = encoded()
-    bad.header.descriptor.model_id = "another-model"
+    bad.header.image_descriptor.model_id = "another-model"
     with pytest.raises(DescriptorModelMismatch, match=f"{MODEL_ID}.*another-model"):
         await registered.submit_encoded(bad)
     await assert_nothing_is_left(server, registered)

@@ -407,36 +407,36 @@ class QueryLoopsRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     SUBMAP_FIELD_NUMBER: _builtins.int
-    DESCRIPTOR_FIELD_NUMBER: _builtins.int
+    IMAGE_DESCRIPTOR_FIELD_NUMBER: _builtins.int
     SESSION_FIELD_NUMBER: _builtins.int
     MAX_CANDIDATES_FIELD_NUMBER: _builtins.int
     MIN_SIMILARITY_FIELD_NUMBER: _builtins.int
     submap: _builtins.str
     """Resource name of a stored sub-map: its recorded candidates, as source and as target."""
     session: _builtins.str
-    """Resource name `sessions/{session}`; required with `descriptor`, ignored with `submap`."""
+    """Resource name `sessions/{session}`; required with `image_descriptor`, ignored with `submap`."""
     max_candidates: _builtins.int
     """Most candidates to return, 1 to 1000; 0 means 10 for a descriptor and all for a sub-map."""
     min_similarity: _builtins.float
     """Leave out candidates of lower cosine similarity, -1 to 1. 0 (unset) leaves out negative ones."""
     @_builtins.property
-    def descriptor(self) -> _geometry_pb2.Descriptor:
+    def image_descriptor(self) -> _geometry_pb2.Descriptor:
         """A raw descriptor, compared with every sub-map of `session`."""
 
     def __init__(
         self,
         *,
         submap: _builtins.str = ...,
-        descriptor: _geometry_pb2.Descriptor | None = ...,
+        image_descriptor: _geometry_pb2.Descriptor | None = ...,
         session: _builtins.str = ...,
         max_candidates: _builtins.int = ...,
         min_similarity: _builtins.float = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["descriptor", b"descriptor", "query", b"query", "submap", b"submap"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["image_descriptor", b"image_descriptor", "query", b"query", "submap", b"submap"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["descriptor", b"descriptor", "max_candidates", b"max_candidates", "min_similarity", b"min_similarity", "query", b"query", "session", b"session", "submap", b"submap"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["image_descriptor", b"image_descriptor", "max_candidates", b"max_candidates", "min_similarity", b"min_similarity", "query", b"query", "session", b"session", "submap", b"submap"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["submap", "descriptor"]  # noqa: Y015
+    _WhichOneofReturnType_query: _TypeAlias = _typing.Literal["submap", "image_descriptor"]  # noqa: Y015
     _WhichOneofArgType_query: _TypeAlias = _typing.Literal["query", b"query"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType_query) -> _WhichOneofReturnType_query | None: ...
 
@@ -864,7 +864,7 @@ class LocalizeRequest(_message.Message):
     COLOUR_MEDIA_TYPE_FIELD_NUMBER: _builtins.int
     DEPTH_PNG_FIELD_NUMBER: _builtins.int
     METRES_PER_UNIT_FIELD_NUMBER: _builtins.int
-    DESCRIPTOR_FIELD_NUMBER: _builtins.int
+    IMAGE_DESCRIPTOR_FIELD_NUMBER: _builtins.int
     session: _builtins.str
     """Resource name `sessions/{session}`."""
     colour: _builtins.bytes
@@ -880,7 +880,7 @@ class LocalizeRequest(_message.Message):
         """Intrinsics of the image."""
 
     @_builtins.property
-    def descriptor(self) -> _geometry_pb2.Descriptor:
+    def image_descriptor(self) -> _geometry_pb2.Descriptor:
         """Descriptor of the colour image, by the session's model."""
 
     def __init__(
@@ -892,11 +892,11 @@ class LocalizeRequest(_message.Message):
         colour_media_type: _builtins.str = ...,
         depth_png: _builtins.bytes = ...,
         metres_per_unit: _builtins.float = ...,
-        descriptor: _geometry_pb2.Descriptor | None = ...,
+        image_descriptor: _geometry_pb2.Descriptor | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "descriptor", b"descriptor"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "image_descriptor", b"image_descriptor"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "colour", b"colour", "colour_media_type", b"colour_media_type", "depth_png", b"depth_png", "descriptor", b"descriptor", "metres_per_unit", b"metres_per_unit", "session", b"session"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "colour", b"colour", "colour_media_type", b"colour_media_type", "depth_png", b"depth_png", "image_descriptor", b"image_descriptor", "metres_per_unit", b"metres_per_unit", "session", b"session"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -212,7 +212,7 @@ class SubmapHeader(_message.Message):
     CAMERA_FIELD_NUMBER: _builtins.int
     TRAJECTORY_FIELD_NUMBER: _builtins.int
     KEYFRAMES_FIELD_NUMBER: _builtins.int
-    DESCRIPTOR_FIELD_NUMBER: _builtins.int
+    IMAGE_DESCRIPTOR_FIELD_NUMBER: _builtins.int
     ODOMETRY_FIELD_NUMBER: _builtins.int
     WORLD_FROM_ANCHOR_PRIOR_FIELD_NUMBER: _builtins.int
     BLOBS_FIELD_NUMBER: _builtins.int
@@ -238,7 +238,7 @@ class SubmapHeader(_message.Message):
         """At least one; keyframe 0 is the anchor image, which registration uses."""
 
     @_builtins.property
-    def descriptor(self) -> _geometry_pb2.Descriptor:
+    def image_descriptor(self) -> _geometry_pb2.Descriptor:
         """Descriptor of the anchor image."""
 
     @_builtins.property
@@ -263,15 +263,15 @@ class SubmapHeader(_message.Message):
         camera: _geometry_pb2.Camera | None = ...,
         trajectory: _abc.Iterable[Global___TrackedFrame] | None = ...,
         keyframes: _abc.Iterable[Global___Keyframe] | None = ...,
-        descriptor: _geometry_pb2.Descriptor | None = ...,
+        image_descriptor: _geometry_pb2.Descriptor | None = ...,
         odometry: Global___OdometryEdge | None = ...,
         world_from_anchor_prior: _geometry_pb2.Pose | None = ...,
         blobs: _abc.Iterable[Global___BlobInfo] | None = ...,
         gaussians_blob: _builtins.int = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "descriptor", b"descriptor", "odometry", b"odometry", "world_from_anchor_prior", b"world_from_anchor_prior"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["camera", b"camera", "image_descriptor", b"image_descriptor", "odometry", b"odometry", "world_from_anchor_prior", b"world_from_anchor_prior"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["blobs", b"blobs", "camera", b"camera", "descriptor", b"descriptor", "gaussians_blob", b"gaussians_blob", "keyframes", b"keyframes", "name", b"name", "odometry", b"odometry", "request_id", b"request_id", "trajectory", b"trajectory", "world_from_anchor_prior", b"world_from_anchor_prior"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["blobs", b"blobs", "camera", b"camera", "gaussians_blob", b"gaussians_blob", "image_descriptor", b"image_descriptor", "keyframes", b"keyframes", "name", b"name", "odometry", b"odometry", "request_id", b"request_id", "trajectory", b"trajectory", "world_from_anchor_prior", b"world_from_anchor_prior"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
