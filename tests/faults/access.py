@@ -84,12 +84,18 @@ class Attacker:
     def client(
         self, token: str | None, credentials: ClientCredentials, address: str | None = None
     ) -> MagicClient:
-        """A client that tries once."""
+        """A client that comes back when its connection breaks.
+
+        gRPC's client sometimes loses the answer to a stream that the server ends early, and says
+        that the connection broke.
+        """
         if token is not None:
             file = self._folder / "token"
             file.write_text(token)
             credentials = dataclasses.replace(credentials, token_file=file)
-        config = ClientConfig(attempts=1, rpc_timeout_s=30.0, credentials=credentials)
+        config = ClientConfig(
+            attempts=3, backoff_s=0.05, rpc_timeout_s=30.0, credentials=credentials
+        )
         return MagicClient(address or self.address, config)
 
     async def knock(
