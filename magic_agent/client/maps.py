@@ -103,7 +103,8 @@ class MapCalls(Connection):
     async def get_global_map(self, name: str) -> GaussianCloud:
         """The Gaussians of a map, float32 bit for bit, in its component's world frame.
 
-        `name` is a map's resource name or `sessions/{s}` for the session's newest.
+        `name` is a map's resource name, `sessions/{s}` for the session's newest, or
+        `sessions/{s}/maps/preview` for the preview that follows the pose graph.
         """
         _, data = await self.download_global_map(name, format="lossless")
         return await asyncio.to_thread(codec.decode, data)

@@ -446,7 +446,10 @@ class GetGlobalMapRequest(_message.Message):
     NAME_FIELD_NUMBER: _builtins.int
     FORMAT_FIELD_NUMBER: _builtins.int
     name: _builtins.str
-    """Resource name of a map, or `sessions/{session}` for the session's newest."""
+    """Resource name of a map, or `sessions/{session}` for the session's newest, or
+    `sessions/{session}/maps/preview` for the preview: the sub-maps appended as they were sent, where
+    the pose graph has them now. The preview is also what a session without a merged map answers.
+    """
     format: Global___MapFormat.ValueType
     """The file format."""
     def __init__(
