@@ -53,6 +53,8 @@ class MappingConfig:
     """Share of the steps that go to the newest keyframe; the rest is spread over the sub-map."""
     seeding: Literal["adaptive", "uniform"] = "adaptive"
     """`adaptive`: a quadtree of flat Gaussians. `uniform`: the paper's sample of pixels."""
+    fill_holes: bool = False
+    """Seed where there is no depth reading too, at the depth of the surroundings."""
     seeds_per_keyframe: int = 30_000
     """Most Gaussians that one keyframe may add (M_k of the paper)."""
     seed_opacity: float = 0.9
@@ -135,4 +137,5 @@ def paper_schedule(config: MappingConfig) -> MappingConfig:
         prune_opacity=0.1,
         max_gaussians=_UNBOUNDED,
         exposure_step=0.0,
+        fill_holes=False,
     )

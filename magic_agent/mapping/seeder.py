@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_agent.mapping.config import MappingConfig
+from magic_agent.mapping.holes import filled
 from magic_core.data import Frame
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.seeding import (
@@ -65,6 +66,10 @@ class Seeder:
     ) -> GaussianCloud:
         """New Gaussians, at most `limit`; a view of None means that the sub-map is empty."""
         need = frame.depth > 0 if view is None else self.need(frame, view)
+        depth = frame.depth
+        if self._config.fill_holes:
+            unseen = True if view is None else view.alpha < self._config.alpha_threshold
+            need, depth = need | ((depth <= 0) & unseen), filled(depth)
         limit = min(limit, self._config.seeds_per_keyframe)
         if not need.any():
             return GaussianCloud.empty()
@@ -81,9 +86,9 @@ class Seeder:
             )
         return seed_adaptive(
             frame.colour,
-            frame.depth,
+            depth,
             self._camera,
-            surface=surface_of(frame.depth, self._camera),
+            surface=surface_of(depth, self._camera),
             need=need,
             rule=self._rule,
             shape=self._shape,
