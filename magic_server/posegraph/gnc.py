@@ -51,7 +51,7 @@ class Annealing:
 
 CAREFUL = Annealing(step=2.0, iterations=2)
 """From a start that drift may have carried far away."""
-SWIFT = Annealing(step=4.0, iterations=1)
+SWIFT = Annealing(step=2.0, iterations=1)
 """From a start that most loops agree with already."""
 
 
