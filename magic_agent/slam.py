@@ -180,6 +180,10 @@ class LocalSlam:
 
     def _reference(self) -> ReferenceView:
         """The active sub-map as the tracker sees it; first-order solvers need gradients of it."""
+        if self._config.tracking.backend == "cuda":
+            from magic_agent.tracking.torch_view import TorchView  # loads torch only when asked for
+
+            return TorchView(self._mapper.gaussians(), self._camera)
         if self._config.tracking.solver == "adam":
             threads = self._config.threads or None
             return CloudView(self._mapper.gaussians(), self._camera, threads=threads)

@@ -31,7 +31,9 @@ class GaussNewtonConfig:
     rerender_pixels: float = 3.0
     """Render again where the solution lies farther than this from the pose of the last render."""
     converged_pixels: float = 0.03
-    """A level is done when a step moves the image by less than this, in pixels of that level."""
+    """The finest level is done when a step moves the image by less than this, in its pixels."""
+    coarse_converged_pixels: float = 0.1
+    """The same for coarser levels and for registration to the previous frame: mere starts."""
     photometric: bool = True
     """Estimate gain and bias of each frame."""
     gain_deviation: float = 0.1
@@ -153,6 +155,8 @@ class TrackingConfig:
     """Refinement against the sub-map; `gn` is short for gauss_newton, `adam` is the paper's."""
     initialisation: Initialisation = "dense"
     """Registration to the previous frame that starts the refinement."""
+    backend: Literal["cpu", "cuda"] = "cpu"
+    """What renders the sub-map for tracking: our kernels, or gsplat on a CUDA device."""
     rotation_prealignment: bool = True
     """Align the rotation on tiny images first where the prediction does not fit (fast turns)."""
     gauss_newton: GaussNewtonConfig = field(default_factory=GaussNewtonConfig)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from box_room import CAMERA, room_frame, walk
 
 from magic_agent.mapping import MappingConfig
@@ -18,8 +19,10 @@ from magic_agent.tracking.config import (
     TrackingConfig,
 )
 from magic_agent.tracking.refinement import CloudView
+from magic_agent.tracking.torch_view import TorchView
 from magic_agent.tracking.tracker import Tracker
 from magic_core.data import Frame
+from magic_core.errors import NotSupported
 from magic_core.geometry import se3
 from magic_core.submap import Keyframe
 
@@ -144,6 +147,36 @@ def test_a_place_that_no_keyframe_shows_is_not_found(view):
     behind = ANCHOR @ se3.exp([0.0, 0.0, 0.0, 0.0, np.pi, 0.0])
     tracker = Tracker(CAMERA, CONFIG)
     assert tracker.relocalise(room_frame(behind, 60), keyframes, reference=view) is None
+
+
+def test_the_view_through_torch_is_the_kernels_view_and_has_their_gradient(view):
+    """What gsplat's backend goes through, with the reference renderer in its place."""
+    small = CAMERA.scaled(0.25)
+    cloud = view._cloud.select(np.arange(len(view._cloud.means)) % 12 == 0)
+    kernels = CloudView(cloud, small, threads=1)
+    through_torch = TorchView(cloud, small, backend="reference")
+    ours, theirs = kernels(TRUTH[1]), through_torch(TRUTH[1])
+    assert np.abs(ours.image - theirs.image).max() < 2e-3
+    assert (ours.visible == theirs.visible).mean() > 0.98
+    gradient = np.random.default_rng(0).normal(size=ours.image.shape).astype(np.float32)
+    expected, found = kernels.backward(gradient), through_torch.backward(gradient)
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
+def test_a_cuda_backend_without_a_device_says_what_to_do(view):
+    with pytest.raises(NotSupported, match=r"tracking\.backend cpu"):
+        TorchView(view._cloud, CAMERA)
+
+
+@pytest.mark.gpu
+def test_tracks_through_gsplat(view):
+    result = Tracker(CAMERA, CONFIG).track(
+        FRAMES[2], FRAMES[1], anchor_from_previous=TRUTH[1],
+        anchor_from_before_previous=TRUTH[0], reference=TorchView(view._cloud, CAMERA),
+    )  # fmt: skip
+    assert result.verdict == "ok", result.reason
+    assert error_mm(result.anchor_from_camera, TRUTH[2]) < 12.0
 
 
 def test_adam_descends_the_papers_loss(view):
