@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from concurrent.futures import Executor
 from typing import Any
 
@@ -17,6 +17,16 @@ from magic_server.archive.reader import ArchiveReader
 from magic_server.store import Store, archive_of
 
 PIECE_BYTES = 1 << 20
+
+
+async def _whole(work: Coroutine[Any, Any, None]) -> None:
+    """Run to the end: whoever is cancelled meanwhile waits for it first."""
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.gather(task, return_exceptions=True)
+        raise
 
 
 class Archives:
@@ -70,11 +80,7 @@ class Archives:
                 check_archive, reader.archive, reader.blobs, self._limits
             )
             written = list(reader.blobs.values())
-            await asyncio.shield(
-                asyncio.ensure_future(
-                    self._store.add_session(reader.archive, submaps, written=written)
-                )
-            )
+            await _whole(self._store.add_session(reader.archive, submaps, written=written))
         finally:
             await asyncio.shield(self._in_thread(reader.discard))
         return names.parse_session(reader.archive.session.name)

@@ -41,6 +41,7 @@ class SessionRows:
     removed: Sequence[sa.Row]
     loops: Sequence[sa.Row]
     snapshot: bytes | None
+    settled: bool
     maps: Sequence[sa.Row]
     map_files: Sequence[sa.Row]
 
@@ -89,6 +90,11 @@ class ArchiveTable:
                 ),
                 loops=await _all(connection, sa.select(loops).filter_by(**mine), loops.c.id),
                 snapshot=await _solution(connection, row.id),
+                settled=bool(
+                    await connection.scalar(
+                        sa.select(snapshots.c.settled).where(snapshots.c.session_id == row.id)
+                    )
+                ),
                 maps=await _all(connection, sa.select(maps).filter_by(**mine), maps.c.id),
                 map_files=await _all(connection, files, map_files.c.map_id),
             )
@@ -135,6 +141,7 @@ def archive_of(rows: SessionRows) -> tuple[archive_pb2.SessionArchive, list[str]
     archive.agents.extend(_agents(rows))
     if rows.snapshot is not None:
         archive.snapshot.ParseFromString(rows.snapshot)
+        archive.settled = rows.settled
     session = archive.session
     session.name = names.session_name(name)
     session.created_at.CopyFrom(_moment(rows.session.created_at))
@@ -274,6 +281,7 @@ async def _insert_rest(
     if archive.HasField("snapshot"):
         snapshot = archive.snapshot
         values = {"revision": snapshot.revision, "snapshot": snapshot.SerializeToString()}
+        values |= {"settled": archive.settled}
         await connection.execute(sa.insert(snapshots), mine | values)
     for entry in archive.maps:
         info = convert.map_from_proto(entry.map)

@@ -30,7 +30,7 @@ from magicslam.v1 import session_service_pb2 as magicslam_dot_v1_dot_session__se
 from magicslam.v1 import submap_pb2 as magicslam_dot_v1_dot_submap__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1amagicslam/v1/archive.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1bmagicslam/v1/geometry.proto\x1a%magicslam/v1/global_map_service.proto\x1a\"magicslam/v1/mapping_service.proto\x1a\"magicslam/v1/session_service.proto\x1a\x19magicslam/v1/submap.proto\"\xbf\x02\n\x0eSessionArchive\x12&\n\x07session\x18\x01 \x01(\x0b\x32\x15.magicslam.v1.Session\x12#\n\x06\x61gents\x18\x02 \x03(\x0b\x32\x13.magicslam.v1.Agent\x12-\n\x07submaps\x18\x03 \x03(\x0b\x32\x1c.magicslam.v1.ArchivedSubmap\x12.\n\x07removed\x18\x04 \x03(\x0b\x32\x1d.magicslam.v1.ArchivedRemoval\x12*\n\x05loops\x18\x05 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12,\n\x08snapshot\x18\x06 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\x12\'\n\x04maps\x18\x07 \x03(\x0b\x32\x19.magicslam.v1.ArchivedMap\"\x7f\n\x0e\x41rchivedSubmap\x12*\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeader\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x10\n\x08searched\x18\x03 \x01(\x08\"\xf4\x01\n\x0f\x41rchivedRemoval\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\x15\n\rheader_sha256\x18\x03 \x01(\x0c\x12/\n\x0breceived_at\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0cstored_bytes\x18\x05 \x01(\x04\x12,\n\x08odometry\x18\x06 \x01(\x0b\x32\x1a.magicslam.v1.OdometryEdge\x12\x33\n\x17world_from_anchor_prior\x18\x07 \x01(\x0b\x32\x12.magicslam.v1.Pose\"a\n\x0b\x41rchivedMap\x12$\n\x03map\x18\x01 \x01(\x0b\x32\x17.magicslam.v1.GlobalMap\x12,\n\x05\x66iles\x18\x02 \x03(\x0b\x32\x1d.magicslam.v1.ArchivedMapFile\"Z\n\x0f\x41rchivedMapFile\x12\'\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x17.magicslam.v1.MapFormat\x12\x0e\n\x06length\x18\x02 \x01(\x04\x12\x0e\n\x06sha256\x18\x03 \x01(\x0c\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1amagicslam/v1/archive.proto\x12\x0cmagicslam.v1\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1bmagicslam/v1/geometry.proto\x1a%magicslam/v1/global_map_service.proto\x1a\"magicslam/v1/mapping_service.proto\x1a\"magicslam/v1/session_service.proto\x1a\x19magicslam/v1/submap.proto\"\xd0\x02\n\x0eSessionArchive\x12&\n\x07session\x18\x01 \x01(\x0b\x32\x15.magicslam.v1.Session\x12#\n\x06\x61gents\x18\x02 \x03(\x0b\x32\x13.magicslam.v1.Agent\x12-\n\x07submaps\x18\x03 \x03(\x0b\x32\x1c.magicslam.v1.ArchivedSubmap\x12.\n\x07removed\x18\x04 \x03(\x0b\x32\x1d.magicslam.v1.ArchivedRemoval\x12*\n\x05loops\x18\x05 \x03(\x0b\x32\x1b.magicslam.v1.LoopCandidate\x12,\n\x08snapshot\x18\x06 \x01(\x0b\x32\x1a.magicslam.v1.PoseSnapshot\x12\'\n\x04maps\x18\x07 \x03(\x0b\x32\x19.magicslam.v1.ArchivedMap\x12\x0f\n\x07settled\x18\x08 \x01(\x08\"\x7f\n\x0e\x41rchivedSubmap\x12*\n\x06header\x18\x01 \x01(\x0b\x32\x1a.magicslam.v1.SubmapHeader\x12/\n\x0breceived_at\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x10\n\x08searched\x18\x03 \x01(\x08\"\xf4\x01\n\x0f\x41rchivedRemoval\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12\x15\n\rheader_sha256\x18\x03 \x01(\x0c\x12/\n\x0breceived_at\x18\x04 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x14\n\x0cstored_bytes\x18\x05 \x01(\x04\x12,\n\x08odometry\x18\x06 \x01(\x0b\x32\x1a.magicslam.v1.OdometryEdge\x12\x33\n\x17world_from_anchor_prior\x18\x07 \x01(\x0b\x32\x12.magicslam.v1.Pose\"a\n\x0b\x41rchivedMap\x12$\n\x03map\x18\x01 \x01(\x0b\x32\x17.magicslam.v1.GlobalMap\x12,\n\x05\x66iles\x18\x02 \x03(\x0b\x32\x1d.magicslam.v1.ArchivedMapFile\"Z\n\x0f\x41rchivedMapFile\x12\'\n\x06\x66ormat\x18\x01 \x01(\x0e\x32\x17.magicslam.v1.MapFormat\x12\x0e\n\x06length\x18\x02 \x01(\x04\x12\x0e\n\x06sha256\x18\x03 \x01(\x0c\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -38,13 +38,13 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'magicslam.v1.archive_pb2', 
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_SESSIONARCHIVE']._serialized_start=245
-  _globals['_SESSIONARCHIVE']._serialized_end=564
-  _globals['_ARCHIVEDSUBMAP']._serialized_start=566
-  _globals['_ARCHIVEDSUBMAP']._serialized_end=693
-  _globals['_ARCHIVEDREMOVAL']._serialized_start=696
-  _globals['_ARCHIVEDREMOVAL']._serialized_end=940
-  _globals['_ARCHIVEDMAP']._serialized_start=942
-  _globals['_ARCHIVEDMAP']._serialized_end=1039
-  _globals['_ARCHIVEDMAPFILE']._serialized_start=1041
-  _globals['_ARCHIVEDMAPFILE']._serialized_end=1131
+  _globals['_SESSIONARCHIVE']._serialized_end=581
+  _globals['_ARCHIVEDSUBMAP']._serialized_start=583
+  _globals['_ARCHIVEDSUBMAP']._serialized_end=710
+  _globals['_ARCHIVEDREMOVAL']._serialized_start=713
+  _globals['_ARCHIVEDREMOVAL']._serialized_end=957
+  _globals['_ARCHIVEDMAP']._serialized_start=959
+  _globals['_ARCHIVEDMAP']._serialized_end=1056
+  _globals['_ARCHIVEDMAPFILE']._serialized_start=1058
+  _globals['_ARCHIVEDMAPFILE']._serialized_end=1148
 # @@protoc_insertion_point(module_scope)

@@ -39,6 +39,11 @@ class SessionArchive(_message.Message):
     LOOPS_FIELD_NUMBER: _builtins.int
     SNAPSHOT_FIELD_NUMBER: _builtins.int
     MAPS_FIELD_NUMBER: _builtins.int
+    SETTLED_FIELD_NUMBER: _builtins.int
+    settled: _builtins.bool
+    """Whether a solve of the whole graph stands behind the solution; without it the importing server
+    solves at once.
+    """
     @_builtins.property
     def session(self) -> _session_service_pb2.Session:
         """The session; its counts are those of what follows."""
@@ -77,10 +82,11 @@ class SessionArchive(_message.Message):
         loops: _abc.Iterable[_mapping_service_pb2.LoopCandidate] | None = ...,
         snapshot: _mapping_service_pb2.PoseSnapshot | None = ...,
         maps: _abc.Iterable[Global___ArchivedMap] | None = ...,
+        settled: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["session", b"session", "snapshot", b"snapshot"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "loops", b"loops", "maps", b"maps", "removed", b"removed", "session", b"session", "snapshot", b"snapshot", "submaps", b"submaps"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agents", b"agents", "loops", b"loops", "maps", b"maps", "removed", b"removed", "session", b"session", "settled", b"settled", "snapshot", b"snapshot", "submaps", b"submaps"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
