@@ -99,8 +99,7 @@ class SubmapReceiver:
                     return header.name, _repeated(upload)
                 await self._taken(upload, messages, claim)
                 # A client that goes away must not interrupt the transaction.
-                commit = self._background.start(self._commit(upload, on_stored), name=header.name)
-                return header.name, await asyncio.shield(commit)
+                return header.name, await self._finish(self._commit(upload, on_stored))
 
     async def resumption(self, submap: str, request_id: str) -> Resumption:
         """Where an upload goes on; a stream of it that is still open ends.
@@ -230,9 +229,9 @@ class SubmapReceiver:
             logger.warning("%s: the part that came cannot be kept", upload.name.submap)
             await self._in_thread(upload.discard)
 
-    async def _finish(self, work: Coroutine[Any, Any, Any]) -> None:
-        """Run to the end whatever becomes of the caller."""
-        await asyncio.shield(self._background.start(work, name="tidying"))
+    async def _finish(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Run to the end whatever becomes of the caller, who keeps its claim until then."""
+        return await _to_the_end(self._background.start(work, name="finishing"))
 
     async def _commit(
         self, upload: Upload, on_stored: Callable[[AgentRow, Vertex], None]
@@ -257,11 +256,7 @@ class SubmapReceiver:
     async def _whole(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Run on a thread; whoever is cancelled meanwhile waits for its end first."""
         work = asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
-        try:
-            return await asyncio.shield(work)
-        except asyncio.CancelledError:
-            await asyncio.gather(work, return_exceptions=True)
-            raise
+        return await _to_the_end(work)
 
     async def _message(self, messages: Messages) -> mapping_pb.SubmitSubmapRequest | None:
         return await next_message(messages, self._limits.upload_idle_s)
@@ -362,6 +357,24 @@ class Upload:
         if blob.sha256 != self.header.blobs[index].sha256.hex():
             raise CorruptData(f"blobs[{index}]: its SHA-256 is not the header's; send it again")
         self._gaussian_count += check_blob(self.header, index, blob.path.read_bytes())
+
+
+async def _to_the_end(work: asyncio.Future[_T]) -> _T:
+    """The result of work that goes on while the caller is cancelled; the caller ends after it.
+
+    Otherwise the next stream of an upload would find its files while they are still moved about.
+    """
+    cancelled: asyncio.CancelledError | None = None
+    while not work.done():
+        try:
+            await asyncio.wait([work])
+        except asyncio.CancelledError as error:
+            cancelled = error
+    if cancelled is not None:
+        if not work.cancelled():
+            work.exception()  # whoever was cancelled asks for no result
+        raise cancelled
+    return work.result()
 
 
 async def next_message(messages: AsyncIterator[_T], idle_s: float) -> _T | None:

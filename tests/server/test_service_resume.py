@@ -270,3 +270,23 @@ async def test_files_that_nothing_refers_to_are_collected_while_the_server_runs(
         await eventually(lambda: not stray.exists())
         assert set(server._store.blobs.names()) == kept
         assert (await client.download_encoded(NAME)).blobs == encoded().blobs
+
+
+async def test_streams_of_one_upload_that_chase_each_other_store_it_once(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    sent = messages(submap)
+
+    async def chase(delay_s: float) -> None:
+        await asyncio.sleep(delay_s)
+        sending = asyncio.create_task(send(server, sent))
+        await asyncio.sleep(0.004)
+        sending.cancel()  # wherever it is: receiving, giving way, or committing
+        await asyncio.gather(sending, return_exceptions=True)
+
+    await asyncio.gather(*(chase(0.003 * i) for i in range(30)))
+    receipt = await registered.submit_encoded(submap, resume=True)
+    assert receipt.submap == NAME
+    assert (await registered.download_encoded(NAME)).blobs == submap.blobs
+    assert len(await registered.list_submaps("room")) == 1
