@@ -93,6 +93,7 @@ class Previews:
         """
         row = await self._store.agents.session(session)
         coordinator = await self._sessions.coordinator(row)
+        await self._forget_deleted(coordinator)
         last = self._last.get(row.id)
         if last is None or kind not in last.files:
             last = await self._made(coordinator, kind)
@@ -107,6 +108,7 @@ class Previews:
             live = self._sessions.live()
             await self._drop_all_but({coordinator.session.id for coordinator in live})
             for coordinator in live:
+                await self._forget_deleted(coordinator)
                 if self._is_due(coordinator):
                     self._seen[coordinator.session.id] = coordinator.board.revision
                     with contextlib.suppress(NotFound):
@@ -177,11 +179,22 @@ class Previews:
             placed.append(PlacedFiles(pose.submap, stored, transform))
         return tuple(placed)
 
+    async def _forget_deleted(self, coordinator: SessionCoordinator) -> None:
+        """Forget a preview that shows a sub-map which was deleted since."""
+        last = self._last.get(coordinator.session.id)
+        if last is not None:
+            there = {pose.submap for pose in coordinator.board.snapshot.poses}
+            if not there.issuperset(last.info.submaps):
+                await self._forget(coordinator.session.id)
+
     async def _drop_all_but(self, live: set[int]) -> None:
         """Forget sessions that were deleted."""
         for session in self._last.keys() - live:
-            del self._last[session]
-            await self._in_thread(shutil.rmtree, self._root / str(session), True)
+            await self._forget(session)
+
+    async def _forget(self, session: int) -> None:
+        self._last.pop(session, None)
+        await self._in_thread(shutil.rmtree, self._root / str(session), True)
 
     async def _chunks(self, file) -> AsyncIterator[submap_pb2.BlobChunk]:
         def piece(offset: int) -> submap_pb2.BlobChunk | None:

@@ -54,8 +54,9 @@ async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path):
         info, _ = await placed(client, 1)
         for submap in submaps[1:]:
             await client.submit_submap(submap)
-        info, cloud = await placed(client, 3)
-        snapshot = await client.get_corrected_poses("room")
+        await placed(client, 3)
+        snapshot, info = await caught_up(client)
+        cloud = await client.get_global_map(PREVIEW)
         assert info.name == PREVIEW
         assert info.submaps == tuple(s.name for s in submaps)
         assert info.gaussian_count == len(cloud)
@@ -68,6 +69,11 @@ async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path):
         assert len(read_ply(tmp_path / "p.ply")) == len(cloud)
         assert len(list((tmp_path / "previews").glob("*/*"))) == 1  # older ones are gone
 
+        # What is deleted is not shown any more, even before the next preview is made.
+        await client.delete_submap(submaps[2].name, force=True)
+        info, cloud = await placed(client, 2)
+        assert len(cloud) == sum(len(s.gaussians) for s in submaps[:2])
+
         merged = await client.build_global_map("room", coarse_only=True)
         newest, _ = await client.download_global_map("sessions/room")
         assert newest.name == merged.name
@@ -78,6 +84,20 @@ async def eventually(condition) -> None:
     async with asyncio.timeout(60.0):
         while not await condition():  # noqa: ASYNC110  # the state is the server's
             await asyncio.sleep(0.05)
+
+
+async def caught_up(client: MagicClient):
+    """The newest poses, and the preview once it shows them."""
+
+    async def equal() -> bool:
+        info, _ = await client.download_global_map(PREVIEW, format="lossless")
+        return info.revision == (await client.get_corrected_poses("room")).revision
+
+    await eventually(equal)
+    snapshot = await client.get_corrected_poses("room")
+    info, _ = await client.download_global_map(PREVIEW, format="lossless")
+    assert info.revision == snapshot.revision
+    return snapshot, info
 
 
 async def placed(client: MagicClient, count: int):
