@@ -53,7 +53,7 @@ class MappingConfig:
     """Share of the steps that go to the newest keyframe; the rest is spread over the sub-map."""
     seeding: Literal["adaptive", "uniform"] = "adaptive"
     """`adaptive`: a quadtree of flat Gaussians. `uniform`: the paper's sample of pixels."""
-    fill_holes: bool = False
+    fill_holes: bool = True
     """Seed where there is no depth reading too, at the depth of the surroundings."""
     seeds_per_keyframe: int = 30_000
     """Most Gaussians that one keyframe may add (M_k of the paper)."""
