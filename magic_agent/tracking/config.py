@@ -30,10 +30,9 @@ class GaussNewtonConfig:
     """Most renders of the sub-map per frame."""
     rerender_pixels: float = 3.0
     """Render again where the solution lies farther than this from the pose of the last render."""
-    converged_pixels: float = 0.03
-    """The finest level is done when a step moves the image by less than this, in its pixels."""
-    coarse_converged_pixels: float = 0.1
-    """The same for coarser levels and for registration to the previous frame: mere starts."""
+    converged_pixels: float = 0.1
+    """A level is done when a step moves the image by less than this, in pixels of that level; the
+    next step would move it by far less."""
     photometric: bool = True
     """Estimate gain and bias of each frame."""
     gain_deviation: float = 0.1

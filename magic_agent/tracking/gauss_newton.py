@@ -117,14 +117,12 @@ class GaussNewton:
         finest: int | None = None,
     ) -> Alignment:
         """Align from the coarsest to the finest level (inclusive), starting at the given pose."""
-        config = self._config
-        last = config.finest_level if finest is None else finest
+        last = self._config.finest_level if finest is None else finest
         first = len(image) - 1 if coarsest is None else min(coarsest, len(image) - 1)
         terms = [_Term(view, image, self._config) for view in views]
         pose = anchor_from_camera
         for level in range(first, min(last, first) - 1, -1):
-            converged = config.converged_pixels if level == last else config.coarse_converged_pixels
-            pose = self._solve_level(terms, level, pose, prior=prior, converged=converged)
+            pose = self._solve_level(terms, level, pose, prior)
         return self._alignment(terms, pose)
 
     def evaluate(
@@ -142,13 +140,7 @@ class GaussNewton:
         return Alignment(pose, tuple(term.fit() for term in terms), information)
 
     def _solve_level(
-        self,
-        terms: list[_Term],
-        level: int,
-        pose: Float64,
-        *,
-        prior: MotionPrior | None,
-        converged: float,
+        self, terms: list[_Term], level: int, pose: Float64, prior: MotionPrior | None
     ) -> Float64:
         config = self._config
         for term in terms:
@@ -166,7 +158,7 @@ class GaussNewton:
                 damping *= 30.0
                 for term in terms:
                     term.step_back()
-            if pixels_moved(step, terms[0].camera) < converged:
+            if pixels_moved(step, terms[0].camera) < config.converged_pixels:
                 break
         return pose
 

@@ -6,8 +6,6 @@ and the pyramids are those that the refinement needs anyway.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from magic_agent.tracking.config import GaussNewtonConfig
@@ -26,7 +24,7 @@ class Dense:
     """Frame-to-frame alignment of colour and depth on the coarse pyramid levels."""
 
     def __init__(self, config: GaussNewtonConfig, pyramids: PyramidCache) -> None:
-        self._config = replace(config, converged_pixels=config.coarse_converged_pixels)
+        self._config = config
         self._pyramids = pyramids
 
     def reset(self) -> None:
