@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "magic_cli.sessions",
         "list, show, delete, export and import what a server stores",
     ),
+    "view": ("magic_cli.view", "see a session in the browser, live or of a finished run"),
     "eval": ("magic_cli.evaluate", "measure a finished run again and rewrite its report"),
     "export": ("magic_cli.export", "write a run's map or trajectories in other formats"),
     "tracking": ("magic_cli.tracking", "how tracking went: cost, inliers, lost frames, per frame"),

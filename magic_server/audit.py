@@ -80,6 +80,7 @@ class AuditLog:
         self._failures = failures
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="magic-audit")
         self._handler: logging.handlers.RotatingFileHandler | None = None
+        self._closed = False
 
     async def write(self, entry: AuditEntry) -> None:
         """Returns once the line is in the file. A full disk is logged and counted, not raised."""
@@ -88,7 +89,10 @@ class AuditLog:
             await asyncio.get_running_loop().run_in_executor(self._thread, self._append, line)
 
     async def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write what is left and close the file; once more changes nothing."""
+        if self._closed:
+            return
+        self._closed = True
         await asyncio.get_running_loop().run_in_executor(self._thread, self._close)
         self._thread.shutdown(wait=False)
 

@@ -16,7 +16,7 @@ import pytest
 import pytest_asyncio
 
 from magic_agent.client import ClientConfig, MagicClient
-from magic_core.errors import DescriptorModelMismatch, InvalidInput, NotFound
+from magic_core.errors import AlreadyExists, DescriptorModelMismatch, InvalidInput, NotFound
 from magic_core.gaussians.ply import read_ply
 from magic_core.geometry import se3
 from magic_core.submap import Descriptor
@@ -253,8 +253,10 @@ async def test_a_global_map_is_built_with_progress_and_read_in_every_format(
     np.testing.assert_allclose(read_ply(tmp_path / "map.ply").means, cloud.means, atol=1e-6)
     _, compact = await client.download_global_map(info.name, format="compact")
     assert len(compact) < io.BytesIO(data).getbuffer().nbytes / 3
-    repeat = await client.start_global_map("room", request_id="first map")
+    repeat = await client.start_global_map("room", coarse_only=True, request_id="first map")
     assert (repeat.done, repeat.result) == (True, info)
+    with pytest.raises(AlreadyExists, match="another map"):
+        await client.start_global_map("room", request_id="first map")
     assert len(await client.list_operations("room")) == 1
 
 
