@@ -63,7 +63,10 @@ class Tally:
             self.cut_mapping_steps += result.mapped.cut_iterations
 
     def add_submap(self, submap: Submap) -> None:
-        """Append a finished sub-map's frames to the trajectory in the agent's odometry frame."""
+        """Append a finished sub-map's frames to the trajectory in the agent's odometry frame.
+
+        Lost frames are left out: the pose that is held for them was never seen.
+        """
         if submap.odometry is not None:
             self._odometry_from_anchor = (
                 self._odometry_from_anchor @ submap.odometry.previous_from_anchor
@@ -74,6 +77,7 @@ class Tally:
         self._tracked += [
             (frame.timestamp_s, self._odometry_from_anchor @ frame.anchor_from_camera)
             for frame in submap.trajectory
+            if not frame.lost
         ]
 
     def to_json(self) -> dict[str, Any]:
