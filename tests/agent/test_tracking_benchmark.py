@@ -57,7 +57,8 @@ def test_reports_accuracy_and_time_of_a_solver_as_json(recording):
     assert newton["lost_frames"] == newton["breaks"] == 0
     assert 0.0 < newton["ate_rmse_m"]["agent_0"] < 0.02
     assert newton["mean_ate_m"] == newton["ate_rmse_m"]["agent_0"]
-    assert set(newton["stages_ms"]) == {"pyramid", "initialisation", "render", "refinement"}
+    stages = {"pyramid", "rotation", "initialisation", "render", "refinement", "verdict"}
+    assert set(newton["stages_ms"]) == stages
     assert 0.0 < newton["ms_per_frame"]["median"] <= newton["ms_per_frame"]["p95"]
     assert report["speedup"] is None
     assert len(lines) == 1
