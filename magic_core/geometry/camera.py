@@ -11,6 +11,10 @@ from magic_core.errors import FieldViolation, InvalidInput
 
 MAX_IMAGE_PIXELS = 64_000_000
 
+# Bounds in image sides (the centre's in focal lengths too, for crops): fields of view from 0.06 to
+# 178.9 degrees. Beyond them numbers overflow where clouds are cut into voxels.
+_SHORTEST, _LONGEST, _FARTHEST_CENTRE = 0.01, 1000.0, 10.0
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -36,15 +40,18 @@ class Camera:
             size = f"{self.width}x{self.height}"
             rule = f"expected 1 to {MAX_IMAGE_PIXELS} pixels"
             found.append(FieldViolation(f"{field}.width", f"image size {size}: {rule}"))
+        side = max(self.width, self.height, 1)
         for name in ("fx", "fy"):
             value = getattr(self, name)
-            if not np.isfinite(value) or value <= 0:
-                found.append(
-                    FieldViolation(f"{field}.{name}", f"{value}: a focal length is > 0 px")
-                )
-        for name in ("cx", "cy"):
-            if not np.isfinite(getattr(self, name)):
-                found.append(FieldViolation(f"{field}.{name}", "must be finite, in pixels"))
+            if not (np.isfinite(value) and side * _SHORTEST <= value <= side * _LONGEST):
+                low, high = side * _SHORTEST, side * _LONGEST
+                rule = f"a focal length in pixels is {low:g} to {high:g} for this image size"
+                found.append(FieldViolation(f"{field}.{name}", f"{value}: {rule}"))
+        for name, focal in (("cx", self.fx), ("cy", self.fy)):
+            value, limit = getattr(self, name), max(side, focal) * _FARTHEST_CENTRE
+            if not (np.isfinite(value) and abs(value) <= limit):
+                rule = f"expected within {limit:g} px of the image's corner"
+                found.append(FieldViolation(f"{field}.{name}", f"{value}: {rule}"))
         if found:
             raise InvalidInput(found[0].description, violations=tuple(found))
 

@@ -17,6 +17,8 @@ Pose = NDArray[np.float64]
 
 CONTRAST_SIGMA_SHARE = 1.0 / 40.0
 """Width of the window of local contrast normalisation, as a share of the image width."""
+_REACH_M = 100.0
+"""Farther points come of absurd intrinsics or poses; the matchers' voxel counts overflow there."""
 CLOUD_FRAMES = 3
 """So many images make the cloud of the coarse methods on points: their time grows with it."""
 CONTRAST_FLOOR = 0.02
@@ -186,6 +188,7 @@ def _halved(camera: Camera, image: Float32, depth: Float32) -> tuple[Camera, Flo
 def _thinned_cloud(frames: tuple[PreparedFrame, ...], config: RegistrationConfig) -> Float32:
     """The mean point of every occupied voxel, in a fixed order."""
     points = np.concatenate([_anchor_points(frame) for frame in frames])
+    points = points[np.abs(points).max(axis=1, initial=0.0) <= _REACH_M]
     if not len(points):
         return np.zeros((0, 3), np.float32)
     cells = np.floor(points / config.cloud_voxel_m).astype(np.int64)

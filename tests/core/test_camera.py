@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -62,3 +64,18 @@ def test_an_impossible_camera_is_refused_by_field(change, field):
     with pytest.raises(InvalidInput) as caught:
         Camera(**{**values, **change}).validate()
     assert field in [violation.field for violation in caught.value.violations]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("fx", 1e-6), ("fy", 1e9), ("cx", 1e6), ("cy", -1e5), ("fx", np.nan)]
+)
+def test_absurd_intrinsics_are_named_with_their_bounds(field, value):
+    camera = dataclasses.replace(CAMERA, **{field: value})
+    with pytest.raises(InvalidInput) as error:
+        camera.validate()
+    assert error.value.violations[0].field == f"camera.{field}"
+    assert "px" in str(error.value) or "pixels" in str(error.value)
+
+
+def test_a_crop_beside_the_principal_point_is_a_camera():
+    Camera(width=8, height=8, fx=500.0, fy=500.0, cx=-900.0, cy=1200.0).validate()

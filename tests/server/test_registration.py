@@ -111,6 +111,15 @@ def test_empty_depth_gives_no_hypothesis(room):
     np.testing.assert_array_equal(result.information, np.zeros((6, 6)))
 
 
+def test_absurd_intrinsics_give_no_points_that_overflow_the_matchers(room):
+    view = room.view(FIRST)
+    absurd = replace(view, camera=replace(view.camera, fx=1e-6))
+    config = RegistrationConfig(methods=("kiss",))
+    prepared = prepare(absurd, config)
+    assert np.abs(prepared.points).max(initial=0.0) <= 100.0
+    assert not register(prepared, prepare(view, config), config).accepted
+
+
 def test_keyframes_find_what_the_anchors_alone_do_not_see(room):
     away, middle = pose(0.0, -0.5, 150.0), pose(-0.2, -0.8, 25.0)
     colour, depth = room.image(middle)
