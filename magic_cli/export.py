@@ -104,7 +104,7 @@ def named_axes(axes: str) -> str:
 def _chosen_format(config: ExportConfig) -> str:
     possible = FORMATS[config.what]
     by_suffix = _OF_SUFFIX.get(config.out.suffix.lower(), possible[0])
-    chosen: str = config.format or (by_suffix if by_suffix in possible else possible[0])
+    chosen = str(config.format or (by_suffix if by_suffix in possible else possible[0]))
     if chosen not in possible:
         choices = ", ".join(possible)
         raise ConfigError(f"--format {chosen}: {config.what} can be written as {choices}")

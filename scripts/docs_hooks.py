@@ -51,7 +51,14 @@ def describe(file: descriptor_pb2.FileDescriptorProto) -> list[str]:
         for k, method in enumerate(service.method):
             lines += _method(method, comments.get((_SERVICE, i, _METHOD, k), ""))
     for i, enum in enumerate(file.enum_type):
-        lines += [f"### {enum.name}", "", comments.get((_ENUM, i), ""), "", "| value | |", "|---|---|"]
+        lines += [
+            f"### {enum.name}",
+            "",
+            comments.get((_ENUM, i), ""),
+            "",
+            "| value | |",
+            "|---|---|",
+        ]
         lines += [
             f"| `{value.name}` = {value.number} | {comments.get((_ENUM, i, _VALUE, k), '')} |"
             for k, value in enumerate(enum.value)

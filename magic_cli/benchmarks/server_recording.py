@@ -82,8 +82,9 @@ def _submap(
 
     first = index * FRAMES
     times_and_poses = source.timed_poses()[first : first + FRAMES]
-    anchor_from_world = se3.inverse(times_and_poses[0][1])
-    poses = [anchor_from_world @ pose for _, pose in times_and_poses]
+    worlds = [pose for _, pose in times_and_poses if pose is not None]
+    anchor_from_world = se3.inverse(worlds[0])
+    poses = [anchor_from_world @ pose for pose in worlds]
     poses[0] = np.eye(4)
     kept = np.linspace(0, FRAMES - 1, KEYFRAMES).astype(int).tolist()
     images = {i: source[first + i] for i in kept}

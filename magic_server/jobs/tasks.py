@@ -22,8 +22,8 @@ from magic_server.store.blobs import read_checked
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
-    from magic_core.wire.records import MapFormat
     from magic_core.gaussians import GaussianCloud
+    from magic_core.wire.records import MapFormat
     from magic_server.globalmap import MergeConfig
     from magic_server.posegraph import PoseGraphConfig
     from magic_server.posegraph.arrays import ArraySolution, GraphArrays

@@ -55,7 +55,7 @@ def test_every_frame_and_sub_map_is_counted_and_times_add_up(recording):
     beside = stages.pop("encoding, beside them")
     assert beside > 0.0
     assert sum(stages.values()) <= found["wall_ms_per_frame"]
-    assert 0.0 < report["slowest_submap_fps"]
+    assert report["slowest_submap_fps"] > 0.0
     assert report["cores"] == 1
     assert (os.environ.get("MAGIC_THREADS"), os.sched_getaffinity(0)) == before
 
