@@ -38,6 +38,8 @@ class MappingConfig:
     schedule: Literal["paper", "fast"] = "fast"
     """`fast`: adaptive seeding, keyframes by novelty, few iterations. `paper`: every 5th frame,
     uniform seeding, 100 iterations."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the map is optimised; `auto` is cuda where a device and gsplat are, else cpu."""
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     keyframe_every: int = 0
     """Fixed keyframe interval in frames; 0 chooses keyframes by novelty."""

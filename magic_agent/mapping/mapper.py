@@ -19,7 +19,8 @@ from magic_core.errors import WrongState
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.morton import in_morton_order
 from magic_core.geometry import Camera, se3
-from magic_core.render import GaussianOptimiser, LearningRates, LossWeights, RenderedView
+from magic_core.render import LearningRates, LossWeights, RenderedView
+from magic_core.render.backend import Optimiser, new_optimiser
 from magic_core.submap import Keyframe
 
 Pose = NDArray[np.float64]
@@ -88,7 +89,7 @@ class Mapper:
         self._targets: list[Frame] = []
         self._median_depths: list[float] = []
         self._window = Window(self._config.newest_share, self._rng)
-        self._optimiser: GaussianOptimiser | None = None
+        self._optimiser: Optimiser | None = None
         self._overhead_s = self._step_s = 0.0
 
     @property
@@ -206,8 +207,8 @@ class Mapper:
         kept = gaussians.select(visible).transformed(se3.inverse(anchor_from_next))
         return gaussians.select(~visible), kept
 
-    def _new_optimiser(self, gaussians: GaussianCloud) -> GaussianOptimiser:
-        return GaussianOptimiser(
+    def _new_optimiser(self, gaussians: GaussianCloud) -> Optimiser:
+        return new_optimiser(
             gaussians,
             weights=LossWeights(
                 ssim=self._config.ssim_weight,
@@ -216,6 +217,7 @@ class Mapper:
             ),
             learning_rates=LearningRates(means=self._config.means_rate_m),
             threads=self._threads,
+            device=self._config.device,
         )
 
     def _exposure(self, frame: Frame, view: RenderedView | None) -> Exposure | None:
@@ -312,7 +314,7 @@ class Mapper:
             self._active().prune(keep)
         return int((~keep).sum())
 
-    def _active(self) -> GaussianOptimiser:
+    def _active(self) -> Optimiser:
         if self._optimiser is None:
             raise WrongState("the mapper has no sub-map yet: call begin() with the first frame")
         return self._optimiser

@@ -20,6 +20,7 @@ import numpy as np
 
 from magic_core.geometry import se3
 from magic_core.render import GaussianOptimiser, LossWeights
+from magic_core.render.backend import Optimiser
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.placement import PlacedSource, Pose, View, coarse_merge, views_of
 from magic_server.globalmap.quality import mean_psnr
@@ -54,7 +55,7 @@ class Judge:
     novel: Sequence[View]
     """Frames that neither learns from; may be empty."""
 
-    def __call__(self, optimiser: GaussianOptimiser) -> dict[str, float]:
+    def __call__(self, optimiser: Optimiser) -> dict[str, float]:
         """Mean PSNR in dB of each kind."""
         return {
             "train_db": mean_psnr(optimiser, self.train),

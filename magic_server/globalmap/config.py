@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from magic_core.errors import ConfigError, FieldViolation
 
@@ -50,6 +51,8 @@ class MergeConfig:
     """Most keyframes of one block of space, which is refined by itself: bounds the memory."""
     threads: int = 0
     """Threads of the rasteriser; 0 takes its own default."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where maps are optimised; `auto` is cuda where a device and gsplat are, else cpu."""
     seed: int = 0
     """Seed of the order in which keyframes are visited; equal seeds give equal maps."""
 

@@ -19,7 +19,8 @@ from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.seeding import BlockRule, SeedShape, pixels_in_need, seed_adaptive
 from magic_core.gaussians.surface import Surface, surface_of
 from magic_core.geometry import Camera, se3
-from magic_core.render import GaussianOptimiser, RenderedView
+from magic_core.render import RenderedView
+from magic_core.render.backend import Optimiser
 from magic_server.globalmap.placement import View
 
 _NOISE_SHARE = 0.03
@@ -28,7 +29,7 @@ _MAX_EXTRAPOLATION = 2.0
 
 
 def fill_measured(
-    optimiser: GaussianOptimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
+    optimiser: Optimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
 ) -> int:
     """Seed where a view measured surface that the map does not show; returns how many."""
     before = len(optimiser)
@@ -47,7 +48,7 @@ def fill_measured(
 
 
 def fill_unmeasured(
-    optimiser: GaussianOptimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
+    optimiser: Optimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
 ) -> int:
     """Seed where only colour was seen and the map is transparent; returns how many."""
     before = len(optimiser)
@@ -126,7 +127,7 @@ def _depth_at(
 
 
 def _extend(
-    optimiser: GaussianOptimiser,
+    optimiser: Optimiser,
     view: View,
     need: NDArray[np.bool_],
     surface: Surface,

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.morton import in_morton_order
-from magic_core.render import GaussianOptimiser, LossWeights
+from magic_core.render import LossWeights
+from magic_core.render.backend import Optimiser, new_optimiser
 from magic_server.globalmap.blocks import Block, places_of, plan_blocks
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.parts import Parts, fingerprint_of
@@ -186,9 +187,9 @@ def _between(points: NDArray, low: NDArray, high: NDArray) -> NDArray[np.bool_]:
     return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
 
-def optimiser_of(cloud: GaussianCloud, config: MergeConfig) -> GaussianOptimiser:
+def optimiser_of(cloud: GaussianCloud, config: MergeConfig) -> Optimiser:
     """An optimiser with a merge's losses and first learning rates."""
-    return GaussianOptimiser(
+    return new_optimiser(
         cloud,
         weights=LossWeights(
             ssim=config.ssim_weight,
@@ -197,6 +198,7 @@ def optimiser_of(cloud: GaussianCloud, config: MergeConfig) -> GaussianOptimiser
         ),
         learning_rates=rates(config, 0.0),
         threads=config.threads or None,
+        device=config.device,
     )
 
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magic_core.gaussians import GaussianCloud
-from magic_core.render import GaussianOptimiser, LearningRates, Rasteriser
+from magic_core.render import LearningRates, Rasteriser
+from magic_core.render.backend import Optimiser
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.contribution import best_contribution
 from magic_server.globalmap.exposure import ExposureModel
@@ -53,7 +54,7 @@ class FineStage:
 
     def __init__(
         self,
-        optimiser: GaussianOptimiser,
+        optimiser: Optimiser,
         views: Sequence[View],
         config: MergeConfig,
         *,
