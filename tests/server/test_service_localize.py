@@ -127,6 +127,7 @@ def request() -> mapping_pb.LocalizeRequest:
 
 def _huge_camera(sent: mapping_pb.LocalizeRequest) -> None:
     sent.camera.width, sent.camera.height = 60_000, 1_000
+    sent.camera.fx = sent.camera.fy = 50_000.0
 
 
 MALFORMED: dict[str, tuple[Callable[[mapping_pb.LocalizeRequest], object], type, str]] = {
