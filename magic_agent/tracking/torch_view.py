@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magic_core.errors import NotSupported
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera
 from magic_core.render import GaussianTensors, RenderedView, render
+from magic_core.render.backend import require_cuda
 
 
 class TorchView:
@@ -28,11 +28,8 @@ class TorchView:
         *,
         backend: Literal["cuda", "reference"] = "cuda",
     ) -> None:
-        if backend == "cuda" and not torch.cuda.is_available():
-            raise NotSupported(
-                "tracking.backend is cuda, but torch finds no CUDA device here: use "
-                "--tracking.backend cpu, or a CUDA build of torch with 'magic-slam[cuda]'"
-            )
+        if backend == "cuda":
+            require_cuda("--tracking.backend cuda", instead="--tracking.backend cpu")
         device = "cuda" if backend == "cuda" else "cpu"
         self._gaussians = GaussianTensors.from_cloud(cloud, device=device)
         self._camera, self._device = camera, device

@@ -68,11 +68,8 @@ def new_optimiser(
     """
     if device not in ("auto", "cpu", "cuda"):
         raise InvalidInput.field("device", f"{device!r}: expected auto, cpu or cuda")
-    if device == "cuda" and not has_cuda():
-        raise NotSupported(
-            "no CUDA device with gsplat here: pip install 'magic-slam[cuda]' on a CUDA machine, "
-            "or use the device cpu"
-        )
+    if device == "cuda":
+        require_cuda("device cuda", instead="the device cpu")
     if device == "cpu" or not has_cuda():
         return GaussianOptimiser(
             gaussians, learning_rates=learning_rates, weights=weights, threads=threads
@@ -89,3 +86,12 @@ def has_cuda() -> bool:
     import torch
 
     return torch.cuda.is_available()
+
+
+def require_cuda(asked: str, *, instead: str) -> None:
+    """Raise NotSupported, naming what was asked for and what to use instead, without CUDA."""
+    if not has_cuda():
+        raise NotSupported(
+            f"{asked}: no CUDA device with gsplat here: pip install 'magic-slam[cuda]' on a CUDA "
+            f"machine, or use {instead}"
+        )

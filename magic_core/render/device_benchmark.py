@@ -13,13 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from magic_core.errors import NotSupported
 from magic_core.render.api import GaussianTensors, render
-from magic_core.render.backend import has_cuda
+from magic_core.render.backend import new_optimiser, require_cuda
 from magic_core.render.benchmark_scene import benchmark_scene
-from magic_core.render.optimiser import GaussianOptimiser
 from magic_core.render.rasteriser import Rasteriser
-from magic_core.render.torch_optimiser import TorchOptimiser
 
 Cell = tuple[int, int, int]
 CELLS: tuple[Cell, ...] = ((1200, 680, 100_000), (1200, 680, 500_000))
@@ -37,11 +34,8 @@ def run(
 
     Raises NotSupported when cuda is asked for on a machine without it.
     """
-    if device == "cuda" and not has_cuda():
-        raise NotSupported(
-            "no CUDA device with gsplat here: pip install 'magic-slam[cuda]' on a CUDA machine, "
-            "or measure --device cpu"
-        )
+    if device == "cuda":
+        require_cuda("--device cuda", instead="--device cpu")
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     rows = []
     for cell in cells:
@@ -50,16 +44,14 @@ def run(
     return {"device": name, "cells": rows}
 
 
-def _measure(cell: Cell, device: str, repeats: int) -> dict[str, Any]:
+def _measure(cell: Cell, device: Literal["cpu", "cuda"], repeats: int) -> dict[str, Any]:
     cloud, camera = benchmark_scene(*cell)
     gaussians = GaussianTensors.from_cloud(cloud, device=device).requires_grad_()
     shape = (camera.height, camera.width, 3)
     upstream = torch.tensor(np.random.default_rng(1).normal(size=shape), device=device).float()
     view = Rasteriser().render(cloud, camera, np.eye(4))
     colour, depth = (np.clip(view.colour, 0, 1) * 255).astype(np.uint8), view.expected_depth
-    optimiser = (
-        TorchOptimiser(cloud, device=device) if device == "cuda" else GaussianOptimiser(cloud)
-    )
+    optimiser = new_optimiser(cloud, device=device)
 
     def forward_backward() -> None:
         out = render(gaussians, camera, np.eye(4))

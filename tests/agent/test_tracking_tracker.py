@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from box_room import CAMERA, room_frame, walk
 
 from magic_agent.mapping import MappingConfig
@@ -24,6 +23,7 @@ from magic_agent.tracking.tracker import Tracker
 from magic_core.data import Frame
 from magic_core.errors import NotSupported
 from magic_core.geometry import se3
+from magic_core.render.backend import has_cuda
 from magic_core.submap import Keyframe
 
 CONFIG = TrackingConfig(gauss_newton=GaussNewtonConfig(levels=3))
@@ -163,7 +163,7 @@ def test_the_view_through_torch_is_the_kernels_view_and_has_their_gradient(view)
     assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
+@pytest.mark.skipif(has_cuda(), reason="this machine has a CUDA device with gsplat")
 def test_a_cuda_backend_without_a_device_says_what_to_do(view):
     with pytest.raises(NotSupported, match=r"tracking\.backend cpu"):
         TorchView(view._cloud, CAMERA)
