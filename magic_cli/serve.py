@@ -24,6 +24,7 @@ import tyro
 
 from magic_cli.options import parse
 from magic_cli.output import console
+from magic_cli.systemd import notify
 from magic_core import logs, tracing
 from magic_core.errors import ConfigError
 from magic_server.config import ListenConfig, ServerConfig
@@ -58,8 +59,14 @@ def main(arguments: list[str]) -> int:
 
     def ready(server: Server) -> None:
         target = server.address
+        notify(f"READY=1\nSTATUS=serving on {target}")
         if command.progress == "json":
-            ready = {"ready": True, "target": target, "metrics": server.metrics_address}
+            ready = {
+                "ready": True,
+                "target": target,
+                "metrics": server.metrics_address,
+                "health": server.health_address,
+            }
             sys.stdout.write(json.dumps(ready) + "\n")
             sys.stdout.flush()
         else:

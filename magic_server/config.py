@@ -12,6 +12,7 @@ from magic_core.wire import SubmapLimits, Transport
 from magic_server.access import AccessConfig
 from magic_server.audit import AuditConfig
 from magic_server.globalmap import MergeConfig
+from magic_server.health_port import HealthPortConfig
 from magic_server.jobs import JobConfig
 from magic_server.localize_config import LocalizeConfig
 from magic_server.loops import LoopConfig
@@ -90,6 +91,7 @@ class ServerConfig:
     quotas: QuotaConfig = field(default_factory=QuotaConfig)
     resources: ResourceConfig = field(default_factory=ResourceConfig)
     metrics: MetricsConfig = field(default_factory=MetricsConfig)
+    health: HealthPortConfig = field(default_factory=HealthPortConfig)
     audit: AuditConfig = field(default_factory=AuditConfig)
     logs: LogConfig = field(default_factory=LogConfig)
     tracing: TracingConfig = field(default_factory=TracingConfig)

@@ -62,21 +62,21 @@ class Metrics:
         )
         self.jobs = Counter(
             "magic_jobs",
-            "Jobs ended, by job and outcome: ok, failed, or died with its worker.",
-            ("job", "outcome"),
+            "Jobs ended, by task and outcome: ok, failed, or died with its worker.",
+            ("task", "outcome"),
             registry=registry,
         )
         self.job_seconds = Histogram(
             "magic_job_seconds",
             "Time a job took in its worker; solve_pose_graph is the solver's.",
-            ("job",),
+            ("task",),
             buckets=_JOB_BUCKETS_S,
             registry=registry,
         )
         self.job_wait_seconds = Histogram(
             "magic_job_wait_seconds",
             "Time a job waited for a worker.",
-            ("job",),
+            ("task",),
             buckets=_JOB_BUCKETS_S,
             registry=registry,
         )

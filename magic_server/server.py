@@ -30,6 +30,7 @@ from magic_server.calls import CallDesk
 from magic_server.config import LOOPBACK, ServerConfig
 from magic_server.drain import Gate
 from magic_server.globalmaps import GlobalMaps
+from magic_server.health_port import HealthPort
 from magic_server.interceptors import CallInterceptor
 from magic_server.jobs import ProcessExecutor
 from magic_server.localizing import Localizer
@@ -123,6 +124,7 @@ class Server:
             self._store, threads=self._threads, interval_s=config.limits.upkeep_interval_s
         )
         self._probes: ProbePort | None = None
+        self._health_port: HealthPort | None = None
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -141,6 +143,12 @@ class Server:
     def metrics_address(self) -> str | None:
         """Where /metrics, /livez and /readyz are, None where they are off."""
         return None if self._probes is None else f"{self.config.metrics.host}:{self._probes.port}"
+
+    @property
+    def health_address(self) -> str | None:
+        """Where `grpc.health.v1` answers without TLS, None where no such port is open."""
+        port = self._health_port
+        return None if port is None else f"{self.config.health.host}:{port.port}"
 
     async def start(self) -> None:
         """Open the store, take up what was left, and serve."""
@@ -189,6 +197,8 @@ class Server:
         await self._audit.close()
         if self._probes is not None:
             await asyncio.to_thread(self._probes.close)
+        if self._health_port is not None:
+            await self._health_port.close()
         self._threads.shutdown(wait=True)
 
     async def _listen(self) -> None:
@@ -219,6 +229,9 @@ class Server:
             ) from error
         await server.start()
         self._grpc = server
+        if self.config.health.port is not None:
+            self._health_port = HealthPort(self.config.health, self._health)
+            await self._health_port.start()
         if self.config.metrics.port is not None:
             self._observe()
             self._probes = ProbePort(

@@ -94,8 +94,8 @@ async def test_calls_submaps_loops_jobs_and_refusals_are_counted(watched: Server
     assert found["magic_refusals_total{method=GetSession,reason=INVALID_INPUT}"] == 1
     loops = {name: value for name, value in found.items() if name.startswith("magic_loops_total")}
     assert sum(loops.values()) == 1
-    assert found["magic_jobs_total{job=verify_loop,outcome=ok}"] == 1
-    assert found["magic_job_seconds_sum{job=solve_pose_graph}"] > 0
+    assert found["magic_jobs_total{outcome=ok,task=verify_loop}"] == 1
+    assert found["magic_job_seconds_sum{task=solve_pose_graph}"] > 0
     for queue in ("search", "verify", "jobs", "calls", "watches", "uploads"):
         assert found[f"magic_queue_depth{{queue={queue}}}"] == 0
     assert found["magic_disk_free_bytes"] > 0
