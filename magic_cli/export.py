@@ -5,6 +5,7 @@
   points        ply: the Gaussians' means with normals and colours
   trajectories  tum or kitti, one file per agent
   posegraph     g2o
+  rerun         rrd: a Rerun recording of sub-maps, keyframe images, trajectories and loops
 
 `--axes` says what x, y and z of the file point to: (r)ight or (l)eft, (u)p or (d)own, (f)orward or
 (b)ack, of the first camera. Ours are rdf; ROS has flu, Unity ruf, glTF and SPZ want rub.
@@ -13,6 +14,7 @@ Examples:
   magic export runs/demo --what mesh --out scene.glb
   magic export runs/demo --what map --out scene.ply --axes rub
   magic export runs/demo --what trajectories --format kitti --out kitti/
+  magic export runs/demo --what rerun --out demo.rrd
 """
 
 from __future__ import annotations
@@ -38,9 +40,11 @@ FORMATS = {
     "points": ("ply",),
     "trajectories": ("tum", "kitti"),
     "posegraph": ("g2o",),
+    "rerun": ("rrd",),
 }
 _OF_SUFFIX = {".glb": "glb", ".spz": "spz"}
 _SPECIFIED_AXES = {"glb": "rub", "spz": "rub"}
+_RERUN_POINTS = 1_000_000
 _DIRECTION = {"r": "right", "l": "left", "u": "up", "d": "down", "f": "forward", "b": "back"}
 
 
@@ -52,10 +56,21 @@ class ExportConfig:
     """Run folder."""
     out: Path
     """File to write; for trajectories a folder."""
-    what: Literal["map", "mesh", "points", "trajectories", "posegraph"] = "map"
+    what: Literal["map", "mesh", "points", "trajectories", "posegraph", "rerun"] = "map"
     """What to write."""
     format: (
-        Literal["ply", "compressed-ply", "spz", "compact", "lossless", "glb", "tum", "kitti", "g2o"]
+        Literal[
+            "ply",
+            "compressed-ply",
+            "spz",
+            "compact",
+            "lossless",
+            "glb",
+            "tum",
+            "kitti",
+            "g2o",
+            "rrd",
+        ]
         | None
     ) = None
     """Default: what the file's suffix says, else the first of those listed above."""
@@ -85,6 +100,7 @@ def main(arguments: list[str]) -> int:
         "points": _points,
         "trajectories": _trajectories,
         "posegraph": _posegraph,
+        "rerun": _rerun,
     }[config.what]
     written = write(folder, config, chosen, matrix)
     for path in written:
@@ -175,6 +191,18 @@ def _trajectories(
     if not written:
         raise NotFound(f"{folder.path}: no {config.kind} trajectory; is this a finished run?")
     return written
+
+
+def _rerun(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
+    import asyncio
+
+    from magic_cli.view import record
+
+    if not np.array_equal(matrix, np.eye(3)):
+        raise ConfigError(f"--axes {config.axes}: a recording declares its axes itself, as {OURS}")
+    with console.status("reading the stored session"):
+        asyncio.run(record(folder.path, config.out, max_points=_RERUN_POINTS))
+    return [config.out]
 
 
 def _posegraph(

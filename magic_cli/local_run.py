@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import shutil
 import signal
 import time
@@ -28,6 +29,8 @@ from magic_core.evaluation import RunFolder
 
 SESSION = "run"
 SERVER_START_TIMEOUT_S = 120.0
+VIEWER_START_TIMEOUT_S = 60.0
+VIEWER_STOP_TIMEOUT_S = 60.0
 
 
 @dataclass(slots=True)
@@ -50,6 +53,7 @@ class LocalRun:
         self._sources = sources
         self._folder = folder
         self._agents: list[Child] = []
+        self._viewer: Child | None = None
         self._interrupted = False
         self._merging: asyncio.Future | None = None
         self._outcome = Outcome()
@@ -62,11 +66,14 @@ class LocalRun:
                 target = (await processes.wait_ready(server, timeout_s=SERVER_START_TIMEOUT_S))[
                     "target"
                 ]
+                await self._start_viewer(target, progress)
                 await self._run_agents(target, progress)
                 await self._finish(target, progress)
             finally:
                 for child in self._agents:
                     await processes.stop(child, timeout_s=5.0)
+                if self._viewer is not None:  # before the server: it fetches what it lacks
+                    await processes.stop(self._viewer, timeout_s=VIEWER_STOP_TIMEOUT_S)
                 await processes.stop(server)
         return self._outcome
 
@@ -79,6 +86,22 @@ class LocalRun:
             log=self._folder.server_folder / "log.txt",
             threads=1,
         )
+
+    async def _start_viewer(self, target: str, progress: RunProgress) -> None:
+        """The page and the recording, where asked for, in a process of low priority."""
+        config = self._config
+        if not config.viewer and config.rerun is None:
+            return
+        arguments = ["view", target, "--session", SESSION, "--progress", "json"]
+        arguments += ["--port", str(config.viewer_port)] if config.viewer else ["--no-page"]
+        arguments += ["--rerun", str(config.rerun)] if config.rerun is not None else []
+        log = self._folder.server_folder / "view-log.txt"
+        self._viewer = await processes.start("viewer", arguments, log=log, threads=1)
+        with contextlib.suppress(AttributeError, OSError):  # a courtesy not every system has
+            os.setpriority(os.PRIO_PROCESS, self._viewer.process.pid, 5)
+        ready = await processes.wait_ready(self._viewer, timeout_s=VIEWER_START_TIMEOUT_S)
+        if ready["page"] is not None:
+            progress.say(f"Open {ready['page']} in a browser to watch.")
 
     async def _run_agents(self, target: str, progress: RunProgress) -> None:
         start = time.perf_counter()

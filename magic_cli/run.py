@@ -5,6 +5,7 @@ map, and writes one run folder with trajectories, map, metrics and an HTML repor
 
 Examples:
   magic run ~/recordings/office --scale 0.5
+  magic run ~/recordings/office --viewer --rerun office.rrd
   magic run DATASET --tracking.solver adam --json
   magic run DATASET --config runs/office/config.yaml --out runs/again
 
@@ -61,6 +62,12 @@ class RunConfig(AgentConfig):
     """Longest wait for the merged map."""
     report: bool = True
     """Write report.html and overview.png."""
+    viewer: bool = False
+    """Show the map in the browser while it grows; `magic view RUN` shows it again afterwards."""
+    viewer_port: int = 8080
+    """Port of the page, on this machine alone; the next free one where it is taken."""
+    rerun: Path | None = None
+    """Write the run to this Rerun recording (.rrd) as it goes; needs the extra `rerun`."""
     lpips_weights: Path | None = None
     """AlexNet weights for LPIPS (safetensors); default: MAGIC_LPIPS_WEIGHTS or the usual places."""
     candidates: LoopConfig = field(default_factory=LoopConfig)
@@ -96,6 +103,10 @@ def run(config: RunConfig) -> dict:
 
     start = time.perf_counter()
     _refuse_live(config.dataset)
+    if config.rerun is not None:
+        from magic_cli.viewer.recording import require_rerun
+
+        require_rerun(config.rerun)
     sources = open_dataset(
         config.dataset, scale=config.scale, max_frames=config.frames, stride=config.stride
     )

@@ -4,6 +4,7 @@ Examples:
   magic view runs/demo                     # a run folder: opens its stored session
   magic view 192.168.1.20:50051            # a server, while agents run
   magic view 127.0.0.1:50051 --session flat --port 9000
+  magic view 127.0.0.1:50051 --no-page --rerun flat.rrd   # only write what happens, for Rerun
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import sys
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -25,8 +26,12 @@ from magic_agent.client import ClientConfig, MagicClient
 from magic_cli import processes
 from magic_cli.options import parse
 from magic_cli.output import console
-from magic_core.errors import InvalidInput
+from magic_core.errors import ConfigError, DeadlineExceeded, InvalidInput, NotFound, Unavailable
 from magic_core.wire import ClientCredentials
+
+if TYPE_CHECKING:
+    from magic_cli.viewer.feed import Draw
+    from magic_cli.viewer.model import SessionView
 
 _START_TIMEOUT_S = 120.0
 
@@ -43,6 +48,10 @@ class ViewCommand:
     """Where the page is served; 0.0.0.0 lets the whole network look."""
     port: int = 8080
     """Port of the page; the next free one where it is taken."""
+    page: bool = True
+    """Serve the page."""
+    rerun: Path | None = None
+    """Write what happens to this Rerun recording (.rrd) too; needs the extra `rerun`."""
     max_splats: int = 1_000_000
     """Gaussians sent to the browser at most; more are thinned evenly."""
     interval_s: float = 0.5
@@ -64,24 +73,72 @@ def main(arguments: list[str]) -> int:
 
 async def _view(command: ViewCommand) -> None:
     from magic_cli.viewer.feed import Feed
-    from magic_cli.viewer.page import Page
+    from magic_cli.viewer.recording import require_rerun
 
-    if command.max_splats < 1 or command.interval_s <= 0:
-        raise InvalidInput.field("max_splats, interval_s", "expected positive numbers")
+    _check(command)
+    if command.rerun is not None:
+        require_rerun(command.rerun)
     task = asyncio.current_task()
     assert task is not None
     for number in (signal.SIGINT, signal.SIGTERM):  # so that a server of our own ends with us
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     settings = ClientConfig(credentials=command.credentials)
     async with _address(command.target) as address, MagicClient(address, settings) as client:
+        with contextlib.ExitStack() as stack:
+            draw, page = _drawers(command, stack)
+            feed = Feed(client, session=command.session, draw=draw, interval_s=command.interval_s)
+            _say(command, page)
+            try:
+                await feed.run()
+            finally:
+                if command.rerun is not None:
+                    with contextlib.suppress(Unavailable, DeadlineExceeded, NotFound):
+                        await feed.complete()
+
+
+def _check(command: ViewCommand) -> None:
+    if command.max_splats < 1 or command.interval_s <= 0:
+        raise InvalidInput.field("max_splats, interval_s", "expected positive numbers")
+    if not command.page and command.rerun is None:
+        raise ConfigError("--no-page: nothing to do; name a recording with --rerun FILE")
+
+
+def _drawers(command: ViewCommand, stack: contextlib.ExitStack) -> tuple[Draw, str | None]:
+    """What draws each new state, closed by the stack, and the page's address where there is one."""
+    drawers: list[Draw] = []
+    address = None
+    if command.page:
+        from magic_cli.viewer.page import Page
+
         page = Page(host=command.host, port=command.port, max_splats=command.max_splats)
-        try:
-            _say(command, page.address)
-            await Feed(
-                client, session=command.session, draw=page.update, interval_s=command.interval_s
-            ).run()
-        finally:
-            page.close()
+        stack.callback(page.close)
+        drawers.append(page.update)
+        address = page.address
+    if command.rerun is not None:
+        from magic_cli.viewer.recording import Recording
+
+        recording = Recording(command.rerun, max_points=command.max_splats)
+        stack.callback(recording.close)
+        drawers.append(recording.update)
+
+    def draw(view: SessionView) -> None:
+        for drawer in drawers:
+            drawer(view)
+
+    return draw, address
+
+
+async def record(folder: Path, path: Path, *, max_points: int) -> None:
+    """Write the stored session of a run folder to a Rerun recording."""
+    from magic_cli.viewer.feed import Feed
+    from magic_cli.viewer.recording import Recording, require_rerun
+
+    require_rerun(path, overwrite=True)
+    run = _run_folder(str(folder))
+    async with _address(str(run)) as address, MagicClient(address) as client:
+        with contextlib.closing(Recording(path, max_points=max_points)) as recording:
+            feed = Feed(client, session=None, draw=recording.update, interval_s=1.0)
+            await feed.complete()
 
 
 @contextlib.asynccontextmanager
@@ -117,9 +174,11 @@ def _run_folder(target: str) -> Path | None:
     return folder
 
 
-def _say(command: ViewCommand, address: str) -> None:
+def _say(command: ViewCommand, address: str | None) -> None:
     if command.progress == "json":
         sys.stdout.write(json.dumps({"ready": True, "page": address}) + "\n")
         sys.stdout.flush()
-    else:
+    elif address is not None:
         console.print(f"Open {address} in a browser. Ctrl-C ends it.")
+    else:
+        console.print(f"Writing {command.rerun}. Ctrl-C ends it.", markup=False)

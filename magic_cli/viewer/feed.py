@@ -45,11 +45,16 @@ class Feed:
                 log.info("nothing to show yet: %s", error)
             await asyncio.sleep(self._interval_s)
 
+    async def complete(self) -> None:
+        """Follow the session until everything that the server has now is here."""
+        while not await self.refresh():
+            pass
+
     async def refresh(self) -> bool:
-        """One round; False when there was nothing new to download or more is waiting."""
+        """One round; False when more is waiting to be downloaded."""
         view = await self._current_view()
         if view is None:
-            return False
+            return True
         view.snapshot = await self._client.get_corrected_poses(view.session)
         view.agents = await self._client.list_agents(view.session)
         missing = [name for name in view.snapshot.poses if name not in view.submaps]

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from magic_cli.viewer.model import SessionView
+from magic_cli.viewer.model import Pose, SessionView
 from magic_cli.viewer.panel import Panel
 from magic_cli.viewer.scene import Scene
 from magic_core.gaussians import GaussianCloud
@@ -25,13 +25,14 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # its banner; ours comes from the command
             self._server = viser.ViserServer(host=host, port=port, label="magic-slam")
         self._lock = threading.Lock()
+        self._render_lock = threading.Lock()
         self._view: SessionView | None = None
         self._rasteriser: Any = None
         self._panel = Panel(self._server, render=self._rendered, export_map=self._whole_map)
         self._scene = Scene(
             self._server,
             max_splats=max_splats,
-            on_anchor=self._panel.select_anchor,
+            on_keyframe=self._panel.select_keyframe,
             on_loop=self._panel.select_loop,
         )
         self._panel.build(self._scene)
@@ -75,31 +76,38 @@ class Page:
             view = self._view
             if view is None or view.snapshot is None or not view.snapshot.components:
                 return GaussianCloud.empty()
-            return _map_of(view, view.snapshot.components[0].id)
+            parts = _parts_of(view, view.snapshot.components[0].id)
+        return _joined(parts)
 
-    def _rendered(self, name: str) -> NDArray[np.uint8]:
-        """The map from the pose of a sub-map's anchor, (h, w, 3)."""
+    def _rendered(self, name: str, keyframe: int) -> NDArray[np.uint8]:
+        """The map from the pose of a sub-map's keyframe, (h, w, 3)."""
         from magic_core.render import Rasteriser
 
         with self._lock:
             assert self._view is not None
             assert self._view.snapshot is not None
             submap, pose = self._view.submaps[name], self._view.snapshot.poses[name]
-            cloud = _map_of(self._view, pose.component)
+            parts = _parts_of(self._view, pose.component)
+        with self._render_lock:  # a large map takes a second: the page is kept up to date meanwhile
             self._rasteriser = self._rasteriser or Rasteriser()
-            view = self._rasteriser.render(cloud, submap.camera, pose.world_from_anchor)
+            at = pose.world_from_anchor @ submap.keyframes[keyframe].anchor_from_camera
+            view = self._rasteriser.render(_joined(parts), submap.camera, at)
         return (np.clip(view.colour, 0.0, 1.0) * 255).astype(np.uint8)
 
 
-def _map_of(view: SessionView, component: str) -> GaussianCloud:
-    """A component's map in its own world frame."""
+def _parts_of(view: SessionView, component: str) -> list[tuple[GaussianCloud, Pose]]:
+    """What a component's map consists of, each with its pose in the component's world frame."""
     if component in view.merged:
-        return view.merged[component]
+        return [(view.merged[component], se3.identity())]
     assert view.snapshot is not None
+    return [
+        (view.submaps[name].cloud, pose.world_from_anchor)
+        for name, pose in view.snapshot.poses.items()
+        if pose.component == component and name in view.submaps
+    ]
+
+
+def _joined(parts: list[tuple[GaussianCloud, Pose]]) -> GaussianCloud:
     return GaussianCloud.concatenate(
-        [
-            view.submaps[name].cloud.transformed(se3.orthonormalised(pose.world_from_anchor))
-            for name, pose in view.snapshot.poses.items()
-            if pose.component == component and name in view.submaps
-        ]
+        [cloud.transformed(se3.orthonormalised(pose)) for cloud, pose in parts]
     )

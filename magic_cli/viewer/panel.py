@@ -14,16 +14,20 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from magic_cli.loops import EXPLANATIONS, NO_CANDIDATES
+from magic_cli.viewer.colours import loop_colour
 from magic_cli.viewer.model import SessionView
 from magic_cli.viewer.scene import HIDDEN_AT_FIRST, LAYERS, Scene
 from magic_core.evaluation.trajectory import Trajectory, write_tum
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.ply import write_ply
+from magic_core.submap import Keyframe
 from magic_core.wire import names
 from magic_core.wire.records import LoopCandidate
 
 _NONE = "none"
 _ALL = "free camera"
+_ANCHOR = "0 (anchor)"
 _IMAGE = np.full((48, 64, 3), 40, np.uint8)
 
 
@@ -34,7 +38,7 @@ class Panel:
         self,
         server: viser.ViserServer,
         *,
-        render: Callable[[str], NDArray[np.uint8]],
+        render: Callable[[str, int], NDArray[np.uint8]],
         export_map: Callable[[], GaussianCloud],
     ) -> None:
         self._server = server
@@ -43,6 +47,7 @@ class Panel:
         self._view: SessionView | None = None
         self._loops: dict[str, LoopCandidate] = {}
         self._boxes: dict[str, Any] = {}
+        self._keyframe: tuple[str, int] | None = None
         self.following: str | None = None
         """The agent whose camera the page follows."""
 
@@ -66,11 +71,16 @@ class Panel:
         with tabs.add_tab("Loops"):
             self._loop: Any = gui.add_dropdown("candidate", (_NONE,))
             self._loop.on_update(lambda event: self.choose_loop(event.target.value))
-            self._loop_text = gui.add_markdown("Choose a candidate, or click a mark in the map.")
+            self._loop_text = gui.add_markdown(_CHOOSE_LOOP)
             self._loop_images = [gui.add_image(_IMAGE, label=t) for t in ("source", "target")]
         with tabs.add_tab("Keyframe"):
             self._anchor: Any = gui.add_dropdown("sub-map", (_NONE,))
-            self._anchor.on_update(lambda event: self.choose_anchor(event.target.value))
+            self._anchor.on_update(lambda _: self._choose_keyframe(self._anchor.value, 0))
+            self._number: Any = gui.add_dropdown("keyframe", (_ANCHOR,))
+            self._number.on_update(
+                lambda _: self._choose_keyframe(self._anchor.value, _number(self._number.value))
+            )
+            self._keyframe_text = gui.add_markdown("Choose a sub-map, or click a camera.")
             self._real = gui.add_image(_IMAGE, label="camera image")
             self._rendered = gui.add_image(_IMAGE, label="rendered from the map")
         with tabs.add_tab("Export"):
@@ -88,6 +98,8 @@ class Panel:
         self._options(self._anchor, (_NONE, *(short(name) for name in view.submaps)))
         self._loops = {loop_title(c): c for c in view.loops if c.verdict in _SHOWN}
         self._options(self._loop, (_NONE, *self._loops))
+        if self._loop.value == _NONE:
+            self._loop_text.content = _CHOOSE_LOOP if view.loops else NO_CANDIDATES
         for agent in agents:
             if agent not in self._boxes:
                 with self._agent_boxes:
@@ -97,30 +109,48 @@ class Panel:
                 )
 
     def choose_loop(self, title: str) -> None:
-        """Show a candidate's verdict, figures and both images."""
+        """Show a candidate's verdict, figures and both images, and highlight it in the map."""
         loop = self._loops.get(title)
+        self._scene.choose_loop(loop)
         if loop is None or self._view is None:
+            self._loop_text.content = _CHOOSE_LOOP
             return
         self._loop_text.content = loop_text(loop)
         for box, name in zip(self._loop_images, (loop.source, loop.target), strict=True):
             box.image = self._view.submaps[name].keyframes[0].colour
 
     def select_loop(self, loop: LoopCandidate) -> None:
-        """As if it had been chosen in the list."""
+        """As if it had been chosen in the list; said beside the map too, whatever tab is open."""
         self._loop.value = loop_title(loop)
+        self._say(f"Loop {loop_title(loop)}", loop_text(loop, plain=True), loop_colour(loop))
 
-    def choose_anchor(self, title: str) -> None:
-        """Show an anchor image beside the map rendered from its pose."""
-        if self._view is None or title == _NONE:
+    def select_keyframe(self, name: str, number: int) -> None:
+        """As if it had been chosen in the lists."""
+        self._choose_keyframe(short(name), number)
+        self._say(f"Keyframe {number} of {short(name)}", "The tab Keyframe shows it.", _BLUE)
+
+    def _choose_keyframe(self, title: str, number: int) -> None:
+        """Show a camera image beside the map rendered from its pose."""
+        view = self._view
+        name = next((n for n in view.submaps if short(n) == title), None) if view else None
+        if view is None or name is None or self._keyframe == (name, number):
             return
-        name = next((n for n in self._view.submaps if short(n) == title), None)
-        if name is not None:
-            self._real.image = self._view.submaps[name].keyframes[0].colour
-            self._rendered.image = self._render(name)
+        self._keyframe = name, number  # before the lists are set, which calls this again
+        submap = view.submaps[name]
+        numbers = (_ANCHOR, *map(str, range(1, len(submap.keyframes))))
+        self._anchor.value = title
+        self._options(self._number, numbers)
+        self._number.value = numbers[number]
+        keyframe = submap.keyframes[number]
+        self._real.image = keyframe.colour
+        self._keyframe_text.content = f"Frame {keyframe.frame_index} of {submap.agent}, rendering"
+        rendered = self._render(name, number)
+        self._rendered.image = rendered
+        self._keyframe_text.content = keyframe_text(submap.agent, keyframe, rendered)
 
-    def select_anchor(self, name: str) -> None:
-        """As if it had been chosen in the list."""
-        self._anchor.value = short(name)
+    def _say(self, title: str, body: str, colour: tuple[int, int, int]) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification(title, body, auto_close_seconds=8.0, color=colour)
 
     def _on_follow(self, event: Any) -> None:
         self.following = None if event.target.value == _ALL else event.target.value
@@ -147,6 +177,8 @@ class Panel:
 
 
 _SHOWN = ("ACCEPTED", "REJECTED")
+_CHOOSE_LOOP = "Choose a candidate, or click a mark in the map."
+_BLUE = (79, 156, 255)
 
 
 def summary_text(view: SessionView, shown: int) -> str:
@@ -167,17 +199,31 @@ def summary_text(view: SessionView, shown: int) -> str:
 
 
 def agents_text(view: SessionView, *, now: datetime | None = None) -> str:
-    """A table: state, when last heard of, sub-maps."""
+    """A table: state, when last heard of, what it sent, and whom it shares a map with."""
     if not view.agents:
         return "No agent yet."
     now = now or datetime.now(UTC)
     rows = [
         f"| {names.parse_agent(agent.name)[1]} | {agent.state.lower()} | "
         f"{max(0, round((now - agent.last_seen_at).total_seconds()))} s ago | "
-        f"{agent.submap_count} |"
+        f"{agent.submap_count} | {_frames(view, agent.name)} | {_map_of(view, agent.name)} |"
         for agent in view.agents
     ]
-    return "\n".join(["| agent | state | heard of | sub-maps |", "|---|---|---|---|", *rows])
+    head = ["| agent | state | heard of | sub-maps | frames | map |", "|---|---|---|---|---|---|"]
+    return "\n".join([*head, *rows])
+
+
+def _frames(view: SessionView, agent: str) -> int:
+    """Frames in the sub-maps that an agent sent."""
+    return sum(len(s.path) for n, s in view.submaps.items() if n.startswith(f"{agent}/"))
+
+
+def _map_of(view: SessionView, agent: str) -> str:
+    """Whether an agent's sub-maps lie in one map with those of others."""
+    if view.snapshot is None or _frames(view, agent) == 0:
+        return ""
+    joined = any(agent in c.agents and len(c.agents) > 1 for c in view.snapshot.components)
+    return "joined" if joined else "alone"
 
 
 def loop_title(loop: LoopCandidate) -> str:
@@ -186,16 +232,29 @@ def loop_title(loop: LoopCandidate) -> str:
     return f"{short(loop.source)} - {short(loop.target)}: {loop.verdict}{end}"
 
 
-def loop_text(loop: LoopCandidate) -> str:
-    """A candidate's verdict and figures."""
+def loop_text(loop: LoopCandidate, *, plain: bool = False) -> str:
+    """A candidate's verdict and figures, as Markdown or plain text."""
     used = " and relied on" if loop.kept else ""
-    return "  \n".join(
-        [
-            f"**{loop.verdict}{used}**: `{loop.reason}`",
-            f"similarity {loop.similarity:.2f}, overlap {loop.overlap:.2f}",
-            f"fitness {loop.fitness:.2f}, RMSE {1e3 * loop.rmse_m:.1f} mm, {loop.inliers} inliers",
-            f"verified in {loop.verify_seconds:.2f} s",
-        ]
+    set_aside = loop.verdict == "ACCEPTED" and not loop.kept
+    reason = "SET_ASIDE_BY_SOLVER" if set_aside else loop.reason
+    lines = [
+        f"similarity {loop.similarity:.2f}, overlap {loop.overlap:.2f}",
+        f"fitness {loop.fitness:.2f}, RMSE {1e3 * loop.rmse_m:.1f} mm, {loop.inliers} inliers",
+        f"verified in {loop.verify_seconds:.2f} s",
+    ]
+    if plain:
+        return ", ".join(lines)
+    head = [f"**{loop.verdict}{used}**: `{reason}`", EXPLANATIONS.get(reason, "")]
+    return "  \n".join([line for line in (*head, *lines) if line])
+
+
+def keyframe_text(agent: str, keyframe: Keyframe, rendered: NDArray[np.uint8]) -> str:
+    """Which frame it is, and how well the map shows it."""
+    error = np.square(keyframe.colour.astype(np.float64) - rendered).mean()
+    psnr_db = 10.0 * np.log10(255.0**2 / max(float(error), 1e-6))
+    return (
+        f"Frame {keyframe.frame_index} of {agent}, {keyframe.timestamp_s:.2f} s  \n"
+        f"rendered against real: PSNR {psnr_db:.1f} dB"
     )
 
 
@@ -226,3 +285,8 @@ def ply_of(cloud: GaussianCloud) -> bytes:
     """A 3DGS PLY file."""
     with TemporaryDirectory() as at:
         return write_ply(Path(at) / "map.ply", cloud).read_bytes()
+
+
+def _number(title: str) -> int:
+    """The keyframe that an entry of the list names."""
+    return int(title.split()[0])

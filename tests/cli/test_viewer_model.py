@@ -11,7 +11,6 @@ import pytest
 
 from magic_cli.main import run_command
 from magic_cli.viewer.detail import covariances, keep_every, thinned
-from magic_cli.viewer.model import SessionView, SubmapView
 from magic_cli.viewer.panel import (
     agents_text,
     loop_text,
@@ -20,47 +19,19 @@ from magic_cli.viewer.panel import (
     trajectories_zip,
 )
 from magic_core.geometry import se3
-from magic_core.wire.records import (
-    AgentInfo,
-    ComponentInfo,
-    CorrectedPose,
-    LoopCandidate,
-    PoseSnapshot,
-)
-from tests.small_world import make_submap, path
-
-
-def session(*agents_of_components: tuple[int, ...]) -> SessionView:
-    """Two sub-maps of each agent, the agents of one tuple in one component, at the true poses."""
-    view = SessionView("room")
-    poses, components = {}, []
-    for agents in agents_of_components:
-        first = make_submap(agent=agents[0]).name
-        names = []
-        for agent in agents:
-            for index in range(2):
-                submap = make_submap(agent=agent, index=index)
-                view.submaps[submap.name] = SubmapView.of(submap)
-                pose = se3.inverse(path(agents[0], 4)[0]) @ path(agent, 4)[index]
-                poses[submap.name] = CorrectedPose(submap.name, first, pose)
-                names.append(submap.name)
-        components.append(
-            ComponentInfo(
-                first, len(names), tuple(f"sessions/room/agents/agent_{a}" for a in agents)
-            )
-        )
-    view.snapshot = PoseSnapshot("sessions/room", 3, None, poses, tuple(components))
-    return view
+from magic_core.wire.records import AgentInfo, CorrectedPose, LoopCandidate
+from tests.small_world import make_submap
+from tests.viewed_session import viewed_session
 
 
 def test_one_component_stands_in_its_own_world_frame():
-    view = session((0, 1))
+    view = viewed_session((0, 1))
     for name, pose in view.world_from_anchor().items():
         np.testing.assert_allclose(pose, view.snapshot.poses[name].world_from_anchor)
 
 
 def test_components_stand_side_by_side():
-    view = session((0,), (1,))
+    view = viewed_session((0,), (1,))
     anchors = view.world_from_anchor()
     first = [p[0, 3] for n, p in anchors.items() if "agent_0" in n]
     second = [p[0, 3] for n, p in anchors.items() if "agent_1" in n]
@@ -68,7 +39,7 @@ def test_components_stand_side_by_side():
 
 
 def test_tracked_poses_follow_the_odometry_from_the_first_sub_map():
-    view = session((0,))
+    view = viewed_session((0,))
     names = list(view.submaps)
     moved = se3.exp([0.3, 0.0, 0.1, 0.0, 0.2, 0.0])
     old = view.snapshot.poses[names[1]]
@@ -106,7 +77,7 @@ def test_texts_name_verdict_reason_and_figures():
     text = loop_text(loop)
     for part in ("REJECTED", "FREE_SPACE", "0.71", "0.62", "12.3 mm", "87 inliers"):
         assert part in text
-    view = session((0, 1))
+    view = viewed_session((0, 1))
     view.loops = (loop,)
     now = datetime(2026, 1, 1, tzinfo=UTC)
     view.agents = (
@@ -118,7 +89,7 @@ def test_texts_name_verdict_reason_and_figures():
 
 
 def test_exported_trajectories_hold_every_frame():
-    view = session((0, 1))
+    view = viewed_session((0, 1))
     with zipfile.ZipFile(io.BytesIO(trajectories_zip(view))) as archive:
         assert sorted(archive.namelist()) == ["agent_0.txt", "agent_1.txt"]
         lines = [
