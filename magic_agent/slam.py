@@ -362,6 +362,8 @@ class LocalSlam:
         finished = self._submap(active, sent)
         before, self._memory = self._before_last, None
         mapped = self._begin(frame, odometry=edge, carried=kept, mapping_s=mapping_s)
+        if mapped.reexposed:
+            self._tracker.submap_reexposed()
         if before is not None:  # the motion goes on across the seam
             self._before_last = se3.inverse(edge.previous_from_anchor) @ before
         return finished, mapped

@@ -59,6 +59,8 @@ class MappingReport:
     gaussians: int
     """Size of the sub-map afterwards."""
     duration_ms: float
+    reexposed: bool = False
+    """Whether the Gaussians carried over were brought to the exposure of a new anchor."""
 
 
 _UNBOUNDED = MappingBudget()
@@ -126,9 +128,9 @@ class Mapper:
         self._optimiser = self._new_optimiser(
             in_morton_order(carried) if carried is not None else GaussianCloud.empty()
         )
-        if carried is not None:
-            self._expose_as(frame)
-        return self.insert(frame, se3.identity(), budget=budget)
+        reexposed = carried is not None and self._expose_as(frame)
+        report = self.insert(frame, se3.identity(), budget=budget)
+        return replace(report, reexposed=reexposed)
 
     @property
     def least_s(self) -> float:
@@ -232,14 +234,16 @@ class Mapper:
         exposure = self._exposure(frame, view)
         return frame if exposure is None else replace(frame, colour=exposure.removed(frame.colour))
 
-    def _expose_as(self, frame: Frame) -> None:
-        """Bring the carried Gaussians to the exposure of the new anchor."""
+    def _expose_as(self, frame: Frame) -> bool:
+        """Bring the carried Gaussians to the exposure of the new anchor, if that has jumped."""
         exposure = self._exposure(frame, self.render(se3.identity()))
-        if exposure is not None:
-            gaussians = self.gaussians()
-            self._optimiser = self._new_optimiser(
-                replace(gaussians, colours=exposure.applied(gaussians.colours))
-            )
+        if exposure is None:
+            return False
+        gaussians = self.gaussians()
+        self._optimiser = self._new_optimiser(
+            replace(gaussians, colours=exposure.applied(gaussians.colours))
+        )
+        return True
 
     def _seed(self, frame: Frame, anchor_from_camera: Pose, view: RenderedView | None) -> int:
         optimiser = self._active()

@@ -73,6 +73,11 @@ class Tracker:
         self.reset()
         self._usual_colour_error, self._exposure = None, SAME
 
+    def submap_reexposed(self) -> None:
+        """Expect the next image to be as bright as the sub-map, which now has the exposure of the
+        last one: it was brought there."""
+        self._exposure = SAME
+
     def track(
         self,
         frame: Frame,

@@ -43,6 +43,11 @@ def blind(frame: Frame) -> Frame:
     )
 
 
+def darkened(frame: Frame, gain: float) -> Frame:
+    """The frame with less exposure."""
+    return replace(frame, colour=(gain * frame.colour).astype(np.uint8))
+
+
 def run(
     frames: Sequence[Frame], config: SlamConfig = CONFIG, **options
 ) -> tuple[list[FrameResult], list[Submap]]:
@@ -69,6 +74,18 @@ def test_every_frame_is_tracked_to_millimetres_of_its_anchor(walked):
             error = se3.log(se3.inverse(truth) @ tracked.anchor_from_camera)
             assert np.linalg.norm(error[:3]) < 0.006
             assert np.degrees(np.linalg.norm(error[3:])) < 0.25
+
+
+def test_after_an_exposure_jump_the_next_sub_map_is_tracked_at_its_own_exposure():
+    frames = [darkened(frame, 0.35 if frame.index >= 7 else 1.0) for frame in walk(14)]
+    results, submaps = run(frames)
+    assert not any(result.lost for result in results)
+    assert [submap.odometry is None for submap in submaps] == [True, False]
+    tracked = {r.frame_index: r.tracked for r in results if r.tracked is not None}
+    gains = {index: found.gain for index, found in tracked.items()}
+    assert gains[8] == pytest.approx(1 / 0.35, rel=0.15)  # against the brighter sub-map
+    assert [gains[11], gains[12], gains[13]] == pytest.approx([1.0] * 3, rel=0.05)
+    assert not any("relocalisation" in found.stages_ms for found in tracked.values())
 
 
 def test_sub_maps_partition_the_frames_and_begin_with_their_anchor(walked):

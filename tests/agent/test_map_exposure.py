@@ -93,5 +93,7 @@ def test_a_new_sub_map_has_the_exposure_of_its_anchor():
     dark = frame_at(np.eye(4), 1, gain=0.5)
     config = replace(CONFIG, anchor_iterations=1)
     follower = Mapper(CAMERA, config, threads=1)
-    follower.begin(dark, carried=carried)
+    assert follower.begin(dark, carried=carried).reexposed
     assert psnr(follower, dark, np.eye(4)) > 20.0
+    same = frame_at(np.eye(4), 1)
+    assert not follower.begin(same, carried=mapper.split(np.eye(4))[1]).reexposed
