@@ -8,6 +8,7 @@ metres), rot_0..3 (wxyz), all float32, binary little-endian.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,11 +39,16 @@ def write_ply(
 
     `axes` is what the file says of the cloud's axes.
     """
-    path = Path(path)
-    vertices = rows(cloud)
     comments = [f"metres; axes {axes}"]
     comments += [comment] if comment else []
-    data = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+    return write_vertices(Path(path), rows(cloud), comments)
+
+
+def write_vertices(path: Path, vertices: NDArray, comments: Sequence[str]) -> Path:
+    """Write structured rows (n,) as the vertices of a binary PLY, in one step."""
+    data = PlyData(
+        [PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments)
+    )
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         data.write(str(partial))

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 
 from magic_core.gaussians.cloud import GaussianCloud
+from magic_core.gaussians.ply import write_vertices
 from magic_core.geometry import se3
 
 _POINT = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
@@ -27,14 +27,7 @@ def write_points(path: Path, cloud: GaussianCloud, *, comment: str = "") -> Path
     for column, name in enumerate(("red", "green", "blue")):
         rows[name] = colours[:, column]
     comments = ["metres"] + ([comment] if comment else [])
-    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        data.write(str(partial))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+    return write_vertices(path, rows, comments)
 
 
 def shortest_axes(cloud: GaussianCloud) -> NDArray[np.float64]:
