@@ -31,7 +31,7 @@ from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.spool import Spool
 from magic_agent.tally import Tally
 from magic_agent.uplink import Finished, Uplink
-from magic_core.data import EndOfFrames, Frame, FrameSource
+from magic_core.data import UNLIMITED, EndOfFrames, Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
 from magic_core.evaluation import WireBytes
 from magic_core.geometry import se3
@@ -238,7 +238,7 @@ class Agent:
             "frame",
             {
                 "frames": self.tally.frames,
-                "of": len(self._source),
+                "of": None if len(self._source) == UNLIMITED else len(self._source),
                 "lost": self.tally.lost_frames,
                 "dropped": self.tally.dropped_frames,
             },

@@ -142,6 +142,17 @@ def _source(command: AgentCommand):
     raise DataError(f"{command.dataset}: no recording {command.name!r}; it has {names}")
 
 
+def status_line(seen: dict) -> str:
+    """How far an agent is, from the figures of its events; `live` where no length is known."""
+    of = seen.get("of")
+    return (
+        f"frame {seen.get('frames', 0)}{f'/{of}' if of else ', live'}, "
+        f"{seen.get('dropped', 0)} dropped, {seen.get('lost', 0)} lost, "
+        f"{seen.get('submaps', 0)} sub-maps acknowledged, "
+        f"pose graph revision {seen.get('revision', 0)}"
+    )
+
+
 def _observer(progress: str):
     """What becomes of an agent's events: a line of JSON each, a status line, or nothing."""
     if progress == "json":
@@ -158,12 +169,7 @@ def _observer(progress: str):
 
         def show(event: str, figures: dict) -> None:
             seen.update(figures)
-            status.update(
-                f"frame {seen.get('frames', 0)}/{seen.get('of', '?')}, "
-                f"{seen.get('dropped', 0)} dropped, "
-                f"{seen.get('submaps', 0)} sub-maps acknowledged, "
-                f"pose graph revision {seen.get('revision', 0)}"
-            )
+            status.update(status_line(seen))
 
         return show
     return lambda event, figures: None

@@ -27,6 +27,10 @@ class Frame:
     except as the prior of the first pose when the user asks for a known start."""
 
 
+UNLIMITED = 2**31 - 1
+"""Length of a live source that nobody limited: as long as the camera runs."""
+
+
 class EndOfFrames(Exception):
     """A live source has ended, for good: what was seen so far can be finished."""
 
@@ -35,7 +39,7 @@ class FrameSource(Protocol):
     """A sequence of frames of one camera; frames are read lazily, one at a time.
 
     A live source delivers the next frame whatever index is asked for, and raises EndOfFrames when
-    no more will come; its length is the most frames that it would deliver.
+    no more will come; its length is the most frames that it would deliver, or UNLIMITED.
     """
 
     name: str

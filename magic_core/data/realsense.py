@@ -14,15 +14,13 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 import numpy as np
 
-from magic_core.data.frame import EndOfFrames, Frame
+from magic_core.data.frame import UNLIMITED, EndOfFrames, Frame
 from magic_core.data.images import ImagePreparation
 from magic_core.data.intrinsics import Intrinsics
 from magic_core.errors import DataError, NotSupported
 from magic_core.geometry import Camera
 
 SCHEME = "realsense:"
-MOST_FRAMES = 2**31 - 1
-"""Length of a live source that nobody limited: as long as the camera runs."""
 _FRAME_TIMEOUT_MS = 5000
 
 
@@ -78,7 +76,7 @@ class RealSenseSource:
         self.name = name
         self._options = parse_address(address)
         self._library = _load_library()
-        self._stride, self._length = stride, max_frames or MOST_FRAMES
+        self._stride, self._length = stride, max_frames or UNLIMITED
         self._pipeline, profile = self._start()
         weakref.finalize(self, _stop, self._pipeline)
         self._align = self._library.align(self._library.stream.color)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from magic_agent.agent import Agent
 from magic_agent.config import AgentConfig
 from magic_agent.places import load_descriptor_model
-from magic_core.data import EndOfFrames, Frame
+from magic_core.data import UNLIMITED, EndOfFrames, Frame
 from magic_core.evaluation.frame_records import read_frame_records
 from tests.core.small_flat import small_flat, small_frames
 
@@ -21,7 +21,7 @@ class UnpluggedCamera:
         self._next = 0
 
     def __len__(self) -> int:
-        return 2**31 - 1
+        return UNLIMITED
 
     def __getitem__(self, index: int) -> Frame:
         if self._next == DELIVERED:
@@ -31,11 +31,15 @@ class UnpluggedCamera:
 
 
 async def test_what_a_camera_showed_is_sent_when_it_is_unplugged(client, tmp_path, caplog):
+    said: list[dict] = []
     agent = Agent(
         UnpluggedCamera(), client, session="live", name="robot", config=AgentConfig(),
         model=load_descriptor_model(), folder=tmp_path / "robot",
+        observer=lambda event, figures: said.append(figures) if event == "frame" else None,
     )  # fmt: skip
     tally = await agent.run()
+    assert said[-1]["frames"] == DELIVERED
+    assert {figures["of"] for figures in said} == {None}  # nobody knows how many will come
     assert tally.completed
     assert (tally.frames, tally.acknowledged) == (DELIVERED, 1)
     assert "no more frames" in caplog.text

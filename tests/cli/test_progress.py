@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 from magic_cli import progress as module
+from magic_cli.agent import status_line
 from magic_cli.progress import RunProgress
 from tests.core.small_flat import small_flat
 
@@ -62,3 +63,9 @@ def test_a_terminal_gets_bars(printed):
     assert "\x1b" in text
     for part in ("agent_0", "18/24", "3 sub-maps", "map"):
         assert part in text
+
+
+def test_an_agent_on_a_camera_says_live_instead_of_a_length():
+    figures = {"frames": 12, "dropped": 1, "lost": 0, "submaps": 2, "revision": 4}
+    assert status_line(figures | {"of": None}).startswith("frame 12, live, 1 dropped, 0 lost")
+    assert status_line(figures | {"of": 90}).startswith("frame 12/90, 1 dropped")
