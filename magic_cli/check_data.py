@@ -52,7 +52,8 @@ def main(arguments: list[str]) -> int:
         for found in report.findings
     ]
     console.print(table(config.path, ["check", "status", "found", "remedy"], rows, words=True))
-    picture = _picture(config, report) if config.draw else None
+    opened = report.findings[0].status != "fail"
+    picture = _picture(config, report) if config.draw and opened else None
     if config.json:
         findings = [dataclasses.asdict(found) for found in report.findings]
         shown = str(picture) if picture else None

@@ -9,7 +9,13 @@ import numpy as np
 
 from magic_core.data.check_calibration import check_depth, check_intrinsics
 from magic_core.data.check_poses import check_poses
-from magic_core.data.discovery import ROSBAG_SCHEME, layout_of, open_dataset, recordings
+from magic_core.data.discovery import (
+    REALSENSE_SCHEME,
+    ROSBAG_SCHEME,
+    layout_of,
+    open_dataset,
+    recordings,
+)
 from magic_core.data.findings import DatasetReport, Finding, Status
 from magic_core.data.frame import Frame
 from magic_core.data.sequence import FileSequence
@@ -49,6 +55,11 @@ def sampled(source: FileSequence, count: int) -> list[int]:
 
 def _recordings(address: str) -> list[tuple[str, str]]:
     """(agent name, what opens it) of each recording; of a bag's address, the bag."""
+    if address.startswith(REALSENSE_SCHEME):
+        raise DataError(
+            f"{address}: a live camera; check-data reads recordings: map what it sees at once with "
+            "`magic agent realsense:`, or record a bag (`rs-record`) and check that"
+        )
     if address.startswith(ROSBAG_SCHEME):
         (source,) = open_dataset(address)
         return [(source.name, address)]

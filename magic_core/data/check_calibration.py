@@ -17,6 +17,8 @@ OWN_SCALE_LAYOUTS = ("Replica", "TUM RGB-D", "plain folder", "ROS bag")
 _COMMON_SCALES = (1000.0, 5000.0, 6553.5, 10000.0, 4000.0, 256.0, 1.0)
 _USUAL_FIELD_DEG = (30, 130)
 _USUAL_MEDIAN_M = (0.7, 12.0)
+_USUAL_NEAREST_M = (0.12, 3.0)  # a hundredth of the readings is nearer; held cameras see something
+_USUAL_FARTHEST_M = 40.0
 _POSSIBLE_MEDIAN_M = (0.25, 30.0)
 
 
@@ -65,7 +67,11 @@ def check_depth(source: FileSequence, frames: list[Frame], *, layout: str) -> It
         f"readings in {100 * share:.0f} % of the pixels, {_metres(low)} to {_metres(high)}, median "
         f"{_metres(middle)} with scale {scale:g}"
     )
-    usual = _USUAL_MEDIAN_M[0] <= middle <= _USUAL_MEDIAN_M[1] and low >= 0.12 and high <= 40
+    usual = (
+        _USUAL_MEDIAN_M[0] <= middle <= _USUAL_MEDIAN_M[1]
+        and _USUAL_NEAREST_M[0] <= low <= _USUAL_NEAREST_M[1]
+        and high <= _USUAL_FARTHEST_M
+    )
     if not usual:
         yield _doubtful_unit(source, detail, middle, layout)
     elif share < 0.25:
@@ -87,7 +93,7 @@ def scale_remedy(layout: str, scale: float | str) -> str:
 def _doubtful_unit(source: FileSequence, detail: str, middle_m: float, layout: str) -> Finding:
     units = middle_m * source.intrinsics.depth_scale
     likely = [f"{scale:g} ({units / scale:.2f} m)" for scale in _COMMON_SCALES
-              if 0.5 <= units / scale <= 8]  # fmt: skip
+              if 0.5 <= units / scale <= 8 and scale != source.intrinsics.depth_scale]  # fmt: skip
     possible = _POSSIBLE_MEDIAN_M[0] <= middle_m <= _POSSIBLE_MEDIAN_M[1]
     status: Status = "warn" if possible else "fail"
     which = " or ".join(likely) or "the true number of"

@@ -15,6 +15,7 @@ from magic_core.geometry import se3
 _PLACES = 8
 _NEIGHBOURS = 5  # frames between the two of a pair that are compared
 _SENSOR_NOISE = 0.008  # relative difference of depth that needs no other explanation
+_ALIKE = 1.5  # times the misfit of the unit as set, which another unit must exceed
 _MISFIT = 0.06  # relative difference that noise does not explain
 
 
@@ -63,7 +64,7 @@ def _convention(source: FileSequence, layout: str) -> Finding:
     detail = f"carried depth {misfit} when read as {DOCUMENTED}"
     if ours <= _SENSOR_NOISE or best > 0.5 * ours:
         if ours <= _MISFIT:
-            return Finding(name, "ok", detail)
+            return Finding(name, "ok", detail + _undecided_unit(medians))
         return Finding(name, "warn", detail, "poses, intrinsics and depth do not fit each other: "
                        "do poses belong to these frames, in this order?")  # fmt: skip
     better = f"{detail}; {100 * best:.1f} % "
@@ -73,6 +74,15 @@ def _convention(source: FileSequence, layout: str) -> Finding:
     scale = source.intrinsics.depth_scale / factor
     return Finding(name, "fail", f"{better}with depth times {factor:g}",
                    f"WRONG DEPTH SCALE: {scale_remedy(layout, f'{scale:g}')}")  # fmt: skip
+
+
+def _undecided_unit(medians: dict[tuple[str, float], float]) -> str:
+    """Says so where the camera turned without moving: then any depth unit fits the poses."""
+    ours = medians[(DOCUMENTED, 1.0)]
+    others = [e for (c, factor), e in medians.items() if c == DOCUMENTED and factor in (0.2, 5.0)]
+    if min(others) > _ALIKE * ours + _SENSOR_NOISE:
+        return ""
+    return "; the camera moved too little to tell the depth unit by it"
 
 
 def _misfits(source: FileSequence) -> dict[tuple[str, float], float]:

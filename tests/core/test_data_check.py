@@ -136,6 +136,27 @@ def test_an_absent_ground_truth_is_no_fault(recording):
     assert any("none" in f.detail for f in report.findings if f.name == "ground truth")
 
 
+def test_a_live_camera_is_told_what_can_be_checked():
+    (failed,) = check_dataset("realsense:").findings
+    assert "live camera" in failed.detail
+    assert "magic agent" in failed.remedy
+
+
+def test_a_wrong_depth_scale_is_suspected_where_the_camera_only_turned(tmp_path):
+    """Poses of a turning camera fit any depth unit; but nothing nearer than 3 m is unusual."""
+    original = SHARED_DATA / "tum_fr1_rpy_excerpt"
+    if not original.is_dir():
+        pytest.skip(f"{original} is not there")
+    folder = shutil.copytree(original, tmp_path / "freiburg1_rpy")
+    right = findings(folder, "ok")
+    assert "too little to tell the depth unit" in right["pose convention"].detail
+    camera = {"w": 640, "h": 480, "fx": 517.3, "fy": 516.5, "cx": 318.6, "cy": 255.3, "scale": 1000}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    suspected = findings(folder, "warn")["depth"]
+    assert "WRONG DEPTH SCALE?" in suspected.remedy
+    assert "5000 (1.16 m)" in suspected.remedy
+
+
 @pytest.mark.parametrize(
     "name",
     ["tum_fr1_rpy_excerpt", *(pytest.param(n, marks=pytest.mark.slow)
