@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "map a dataset here: server, one process per agent, report",
     ),
     "serve": ("magic_cli.serve", "start a server that agents on any machine can join"),
+    "worker": ("magic_cli.worker", "compute for servers: a worker of a Dask cluster"),
     "agent": ("magic_cli.agent", "run one agent against a server"),
     "sessions": (
         "magic_cli.sessions",

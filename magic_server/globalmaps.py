@@ -193,13 +193,16 @@ class GlobalMaps:
         await self._advance(operation, "RUNNING", 0.0, "starting")
         job = self._tasks.start(self._jobs.run(merge_submaps, task), name="merge job")
         last = None
-        while not job.done():
-            await asyncio.wait([job], timeout=POLL_S)
-            progress = await self._in_thread(read_progress, task.folder)
-            if progress is not None and progress != last:
-                last = progress
-                await self._advance(operation, "RUNNING", *progress)
-        return job.result()
+        try:
+            while not job.done():
+                await asyncio.wait([job], timeout=POLL_S)
+                progress = await self._in_thread(read_progress, task.folder)
+                if progress is not None and progress != last:
+                    last = progress
+                    await self._advance(operation, "RUNNING", *progress)
+            return job.result()
+        finally:
+            job.cancel()  # where the operation is given up
 
     async def _keep(
         self,

@@ -32,7 +32,7 @@ from magic_server.drain import Gate
 from magic_server.globalmaps import GlobalMaps
 from magic_server.health_port import HealthPort
 from magic_server.interceptors import CallInterceptor
-from magic_server.jobs import ProcessExecutor
+from magic_server.jobs import new_executor
 from magic_server.localizing import Localizer
 from magic_server.metrics import Metrics
 from magic_server.native_log import NativeLog
@@ -77,8 +77,11 @@ class Server:
         threads = config.limits.io_threads
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix="magic-io")
         self.metrics = Metrics()
-        self._jobs = ProcessExecutor(
-            config.jobs, trace=config.tracing, observer=self.metrics.job_done
+        self._jobs = new_executor(
+            config.jobs,
+            folder=config.data_dir,
+            trace=config.tracing,
+            observer=self.metrics.job_done,
         )
         self._store = Store(
             config.data_dir, self._threads, partial_uploads=config.limits.partial_uploads
@@ -156,6 +159,7 @@ class Server:
             # Health answers from now on; calls are refused until everything is loaded.
             await self._listen()
             await self._store.open()
+            await self._jobs.start()
             await self.sessions.start()
             await self._maps.start()
             self._upkeep.start()
@@ -250,6 +254,7 @@ class Server:
         room = self._resources.room
         metrics.watch("magic_disk_free_bytes", "Free on the store's disk.", lambda: room().disk)
         metrics.watch("magic_memory_free_bytes", "Memory left.", lambda: room().memory)
+        metrics.watch("magic_job_slots", "Jobs at once, now.", lambda: float(self._jobs.slots))
         metrics.watch("magic_ready", "1 while calls are taken.", lambda: float(gate.ready))
 
     async def _set_ready(self, ready: bool) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,7 @@ def _read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    partial = path.with_suffix(path.suffix + ".partial")
+    # Its own name: an earlier try at the same merge may not have ended yet, elsewhere.
+    partial = path.with_suffix(f"{path.suffix}.{uuid.uuid4().hex}.partial")
     partial.write_bytes(data)
     partial.replace(path)

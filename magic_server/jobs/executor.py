@@ -1,8 +1,4 @@
-"""Where heavy work runs: a protocol, and a pool of spawned processes behind it.
-
-A job is a module-level function and plain arguments; it reads images from disk by path, so that
-little crosses the border. A cluster scheduler fits behind the same protocol.
-"""
+"""The default engine: a pool of spawned processes on this machine."""
 
 from __future__ import annotations
 
@@ -14,55 +10,17 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from magic_core import tracing
-from magic_core.errors import ConfigError, Unavailable
+from magic_core.errors import Unavailable
 from magic_core.tracing import TracingConfig
+from magic_server.jobs.config import JobConfig
+from magic_server.jobs.protocol import JobObserver
 from magic_server.jobs.worker import JobDone, prepare_worker, run_job
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
-
-JobObserver = Callable[[str, str, float, float], None]
-"""Called with a job's name, its outcome (ok, failed or died), and the seconds that it waited for a
-worker and that it ran; both are 0 where they are not known."""
-
-
-@dataclass(frozen=True, slots=True)
-class JobConfig:
-    """The processes that compute."""
-
-    workers: int = 2
-    """Processes; registration, pose graphs and merging share them."""
-    threads_per_worker: int = 1
-    """Threads of the numerical libraries in each."""
-    merge_threads: int = 0
-    """Threads of a merge's rasteriser; 0 takes one per core."""
-    niceness: int = 5
-    """Added to the workers' niceness, so that requests are answered while they compute."""
-
-    def __post_init__(self) -> None:
-        if self.workers < 1 or self.threads_per_worker < 1 or self.merge_threads < 0:
-            raise ConfigError.field("jobs", "workers and threads_per_worker are at least 1")
-
-
-class JobExecutor(Protocol):
-    """Runs functions elsewhere."""
-
-    @property
-    def workers(self) -> int:
-        """How many jobs run at once."""
-        ...
-
-    async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
-        """The function's result, or the error it raised. Unavailable when the worker died twice."""
-        ...
-
-    async def close(self) -> None:
-        """End the workers; jobs under way are lost."""
-        ...
 
 
 class ProcessExecutor:
@@ -70,12 +28,12 @@ class ProcessExecutor:
 
     def __init__(
         self,
-        config: JobConfig = JobConfig(),
+        config: JobConfig | None = None,
         *,
         trace: TracingConfig | None = None,
         observer: JobObserver = lambda job, outcome, waited_s, ran_s: None,
     ) -> None:
-        self._config = config
+        self._config = config or JobConfig()
         self._trace = trace or TracingConfig()
         self._observer = observer
         self._open = 0
@@ -89,9 +47,17 @@ class ProcessExecutor:
         return self._config.workers
 
     @property
+    def slots(self) -> int:
+        """How many jobs could run at once now."""
+        return self._config.workers
+
+    @property
     def waiting(self) -> int:
         """Jobs that wait for a worker."""
         return max(0, self._open - self._config.workers)
+
+    async def start(self) -> None:
+        """Nothing: processes start with the first jobs."""
 
     async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
         """The function's result, or the error it raised. Unavailable when the worker died twice."""

@@ -6,8 +6,7 @@ import dataclasses
 import functools
 import json
 import os
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ from magicslam.v1 import submap_pb2
 from magic_core.errors import MagicError
 from magic_core.geometry import Camera
 from magic_core.wire import geometry, images
+from magic_server.jobs.attempt import Attempt, made_whole
 from magic_server.store.blobs import read_checked
 from magic_server.store.rows import StoredSubmap
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from magic_server.posegraph.arrays import ArraySolution, GraphArrays
     from magic_server.registration import AnchorView, PreparedView, RegistrationConfig
     from magic_server.registration.register import RegistrationResult
-
-_PROGRESS_INTERVAL_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +121,7 @@ class PreviewTask:
     submaps: tuple[PlacedFiles, ...]
     kinds: tuple[MapFormat, ...]
     folder: Path
-    """A folder that does not exist yet."""
+    """A folder that does not exist yet, or that an earlier try at the same job made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,14 +149,14 @@ def append_submaps(task: PreviewTask) -> PreviewOutcome:
         "lossless": stream.write_lossless_pieces,
         "compact": stream.write_compact_pieces,
     }
-    task.folder.mkdir(parents=True)
     files = []
-    for kind in task.kinds:
-        path = task.folder / kind
-        write[kind](path, pieces)
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        files.append((kind, (path, digest, path.stat().st_size)))
+    with made_whole(task.folder) as partial:
+        for kind in task.kinds:
+            path = partial / kind
+            write[kind](path, pieces)
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            files.append((kind, (task.folder / kind, digest, path.stat().st_size)))
     count = sum(source.gaussian_count() for source in sources)
     return PreviewOutcome(count, tuple(files))
 
@@ -214,20 +212,24 @@ def merge_submaps(task: MergeTask) -> MergeOutcome:
     from magic_core.gaussians import stream
     from magic_server.globalmap.merge import merge_into
 
-    report = _progress_writer(task.folder / "progress.json")
+    attempt = Attempt(task.folder)
     config = task.config
     if not config.threads:
         config = dataclasses.replace(config, threads=threads)
     sources = [StoredSource.of(item) for item in task.submaps]
-    parts, summary = merge_into(task.folder, sources, config, progress=report)
+    parts, summary = merge_into(task.folder, sources, config, progress=attempt.report)
     outcome = MergeOutcome(
         summary.gaussians,
         *(task.folder / name for name in ("map.ply", "map.lossless", "map.compact")),
     )
     pieces = functools.partial(parts.clouds, summary.blocks)
-    stream.write_ply_pieces(outcome.ply, pieces)
-    stream.write_lossless_pieces(outcome.lossless, pieces)
-    stream.write_compact_pieces(outcome.compact, pieces)
+    for path, write in (
+        (outcome.ply, stream.write_ply_pieces),
+        (outcome.lossless, stream.write_lossless_pieces),
+        (outcome.compact, stream.write_compact_pieces),
+    ):
+        with attempt.file(path) as partial:
+            write(partial, pieces)
     return outcome
 
 
@@ -297,19 +299,3 @@ def _images(
         size=size,
     )
     return colour, depth
-
-
-def _progress_writer(path: Path) -> Callable[[float, str], None]:
-    """Replaces the progress file in one step, a few times a second at most."""
-    last = -1.0
-
-    def report(share: float, stage: str) -> None:
-        nonlocal last
-        if time.monotonic() - last < _PROGRESS_INTERVAL_S and 0.0 < share < 1.0:
-            return
-        last = time.monotonic()
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps([share, stage]))
-        partial.replace(path)
-
-    return report

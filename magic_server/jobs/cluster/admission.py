@@ -1,0 +1,73 @@
+"""Which workers a server gives jobs to: those that are like it and see its data folder.
+
+A server marks its data folder with an id. Each worker that joins the cluster is asked, by this
+module running there, whether it finds that mark; if so it offers the resource `store-<id>`, which
+every job of the server demands. A worker that cannot do the work is thus never given any.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import socket
+import uuid
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magic_server.jobs.cluster.slots import slots_of
+
+if TYPE_CHECKING:
+    from distributed import Worker
+
+ID_FILE = "cluster-id"
+
+
+def versions() -> tuple[str, str]:
+    """Of this project and of Python, as far as both ends of a job must agree."""
+    return version("magic-slam"), ".".join(platform.python_version_tuple()[:2])
+
+
+def mark(folder: Path) -> str:
+    """The id of a data folder, which is given one where it has none."""
+    place = folder / ID_FILE
+    if not place.exists():
+        partial = folder / f"{ID_FILE}.{uuid.uuid4().hex}.partial"
+        partial.write_text(uuid.uuid4().hex)
+        partial.replace(place)
+    return place.read_text().strip()
+
+
+def resource_of(store: str) -> str:
+    """The name of the resource that workers offer which see a data folder."""
+    return f"store-{store}"
+
+
+async def admit(
+    store: str, folder: str, expected: tuple[str, str], *, dask_worker: Worker
+) -> str | None:
+    """Let a worker offer its service to a server, or say why it does not. Runs on the worker."""
+    slots = slots_of(dask_worker)
+    refusal = _refusal(store, slots.root(folder), expected)
+    if refusal is None:
+        await dask_worker.set_resources(**{resource_of(store): float(dask_worker.state.nthreads)})
+    return refusal
+
+
+def _refusal(store: str, root: Path, expected: tuple[str, str]) -> str | None:
+    here = socket.gethostname()
+    if versions() != expected:
+        own, wanted = (f"magic-slam {m} on Python {p}" for m, p in (versions(), expected))
+        return f"{here} has {own}, the server {wanted}; install the same on both"
+    remedy = "mount the server's data folder there, and give magic worker --data-dir where it is"
+    try:
+        found = (root / ID_FILE).read_text().strip()
+    except OSError as error:
+        return (
+            f"{here} does not see the server's data folder at {root} ({error.strerror}); {remedy}"
+        )
+    if found != store:
+        return f"{root} on {here} is the data folder of another server; {remedy}"
+    if not os.access(root, os.W_OK):
+        return f"{root} on {here} cannot be written; mount it so that its user may write"
+    return None
