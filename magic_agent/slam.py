@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_agent.mapping.mapper import Mapper, MappingBudget, MappingReport
+from magic_agent.mapping.mapper import Closing, Mapper, MappingBudget, MappingReport
 from magic_agent.memory import SubmapMemory
 from magic_agent.odometry import ActiveSubmap, Opening, anchor_overlap, hand_over_edge
 from magic_agent.resume import ResumePoint
@@ -149,6 +149,7 @@ class LocalSlam:
         """Close the last sub-map, all its Gaussians included; None where there is none."""
         if self._active is None:
             return None
+        self._mapper.close()
         finished = self._submap(self._active, self._mapper.gaussians())
         self._active = None
         return finished
@@ -339,9 +340,10 @@ class LocalSlam:
             self._agent, self._lost_in_a_row, frame.index, self._next_index,
         )  # fmt: skip
         started = self._clock()
+        closing, mapping_s = self._close(mapping_s)
         finished, self._memory = self._submap(active, self._mapper.gaussians()), None
         self._tracker.begin_chain()
-        mapped = self._begin(frame, odometry=None, mapping_s=mapping_s)
+        mapped = closing.added_to(self._begin(frame, odometry=None, mapping_s=mapping_s))
         return self._result(
             frame,
             self._next_index - 1,
@@ -356,6 +358,7 @@ class LocalSlam:
     def _hand_over(
         self, frame: Frame, active: ActiveSubmap, edge: OdometryEdge, mapping_s: float | None
     ) -> tuple[Submap, MappingReport]:
+        closing, mapping_s = self._close(mapping_s)
         sent, kept = self._mapper.split(edge.previous_from_anchor)
         if self._config.submap.send_all:
             sent = self._mapper.gaussians()
@@ -366,7 +369,16 @@ class LocalSlam:
             self._tracker.submap_reexposed()
         if before is not None:  # the motion goes on across the seam
             self._before_last = se3.inverse(edge.previous_from_anchor) @ before
-        return finished, mapped
+        return finished, closing.added_to(mapped)
+
+    def _close(self, mapping_s: float | None) -> tuple[Closing, float | None]:
+        """Close the active sub-map's optimisation; returns also the time that is left for the next
+        one's anchor, which comes first where time is short."""
+        if mapping_s is None:
+            return self._mapper.close(), None
+        spare = MappingBudget(seconds=mapping_s - self._mapper.least_s)
+        closing = self._mapper.close(budget=spare)
+        return closing, mapping_s - closing.seconds
 
     def _begin(
         self,

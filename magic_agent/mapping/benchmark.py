@@ -5,8 +5,10 @@ separately each schedule's own keyframes, are rendered and compared with the ima
 given, so that nothing but mapping differs: the ground truth's, or those of one tracking run.
 
 The two schedules differ in what they spend, so each is also run with the other's budget: the
-same number of optimisation steps per sub-map, and the same time. Time is that of one thread's CPU,
-which other work on the machine does not lengthen.
+same number of optimisation steps per sub-map, and the same time, spread evenly over the keyframes
+that the schedule chose with its own budget. Ours spends what goes beyond its own on closing the
+sub-map (`closing_iterations`). Time is that of one thread's CPU, which other work on
+the machine does not lengthen.
 """
 
 from __future__ import annotations
@@ -20,9 +22,10 @@ from typing import Literal
 from magic_agent.mapping.config import MappingConfig
 from magic_agent.mapping.mapper import Mapper, MappingBudget
 from magic_agent.mapping.quality import Quality, Scores
-from magic_agent.mapping.segments import Poses, Segment, segments_of
+from magic_agent.mapping.segments import Pose, Poses, Segment, segments_of
 from magic_agent.slam_config import SlamConfig
 from magic_core.data import Frame, open_dataset
+from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera
 
 Schedule = Literal["paper", "ours"]
@@ -31,6 +34,7 @@ Progress = Callable[[str], None]
 
 SCHEDULES: tuple[Schedule, Schedule] = ("paper", "ours")
 WITHHELD_EVERY = 5
+_ENDLESS = 1_000_000
 _WITHHELD = 3
 """Frames with this remainder by WITHHELD_EVERY are never mapped; the paper's keyframes have 0."""
 
@@ -41,21 +45,23 @@ class Allowance:
 
     unit: Unit
     amount: float
+    keyframes: tuple[int, ...]
+    """Indices of the frames to map, in order; each gets the same share."""
+    most_iterations: int = _ENDLESS
+    """Steps per keyframe at most; what they leave is for closing the sub-map."""
 
-    def budget(self, *, spent: float, done: float, frames: int, lead: int) -> MappingBudget:
-        """The budget of a keyframe when `done` of the sub-map's frames have gone by.
-
-        The amount is spread evenly over the frames; a keyframe may use the part of the `lead`
-        frames up to the next one too.
-        """
-        share = min(1.0, (done + lead) / frames)
+    def budget(self, *, spent: float, number: int) -> MappingBudget:
+        """The budget of keyframe `number`, counted from 0, after `spent` on those before: its own
+        share, and what they left. The number after the last means the closing steps."""
+        closing = number == len(self.keyframes)
+        share = 1.0 if closing else (number + 1) / len(self.keyframes)
         left = max(0.0, share * self.amount - spent)
+        most = _ENDLESS if closing else self.most_iterations
         if self.unit == "iterations":
-            return MappingBudget(iterations=round(left))
-        return MappingBudget(iterations=_ENDLESS, seconds=left)
+            return MappingBudget(iterations=min(round(left), most))
+        return MappingBudget(iterations=most, seconds=left)
 
 
-_ENDLESS = 1_000_000
 _UNITS: tuple[tuple[Unit, str], ...] = (("iterations", "iterations"), ("seconds", "time"))
 
 
@@ -65,6 +71,8 @@ class Cost:
 
     iterations: int
     seconds: float
+    keyframes: tuple[int, ...]
+    """Indices of the frames that were mapped, in order."""
 
 
 def run(
@@ -133,7 +141,11 @@ class _Bench:
             for unit, word in _UNITS:
                 # Settling early would leave a part of the other's budget unused.
                 config = replace(self._configs[schedule], settle=0.0)
-                allowances = [Allowance(unit, getattr(cost, unit)) for cost in costs[other]]
+                most = config.iterations if schedule == "ours" else _ENDLESS
+                allowances = [
+                    Allowance(unit, getattr(theirs, unit), own.keyframes, most)
+                    for own, theirs in zip(costs[schedule], costs[other], strict=True)
+                ]
                 yield f"{schedule} / {word} of {other}", self._map(segments, config, allowances)
 
     def _map(
@@ -167,33 +179,35 @@ class _SubmapRun:
     def __init__(self, mapper: Mapper, segment: Segment, allowance: Allowance | None) -> None:
         self._mapper, self._segment, self._allowance = mapper, segment, allowance
         self._iterations = 0
+        self._keyframes: list[Frame] = []
         self._started = time.thread_time()
-        every = mapper.config.keyframe_every
-        self._lead = every or mapper.config.keyframes.max_gap + 1
 
     @property
     def cost(self) -> Cost:
-        return Cost(self._iterations, time.thread_time() - self._started)
+        mapped = tuple(frame.index for frame in self._keyframes)
+        return Cost(self._iterations, time.thread_time() - self._started, mapped)
 
-    def map(self, carried) -> list[Frame]:
+    def map(self, carried: GaussianCloud | None) -> list[Frame]:
         """Map the segment; returns its keyframes."""
-        keyframes = [self._segment.frames[0]]
-        report = self._mapper.begin(keyframes[0], carried=carried, budget=self._budget(0))
-        self._iterations = report.iterations
-        pairs = zip(self._segment.frames, self._segment.anchor_from_camera, strict=True)
-        for number, (frame, pose) in enumerate(pairs):
-            if number and not withheld(frame) and self._mapper.wants(frame, pose):
-                report = self._mapper.insert(frame, pose, budget=self._budget(number))
-                self._iterations += report.iterations
-                keyframes.append(frame)
-        return keyframes
+        for frame, pose in zip(self._segment.frames, self._segment.anchor_from_camera, strict=True):
+            if not self._keyframes:
+                report = self._mapper.begin(frame, carried=carried, budget=self._budget())
+            elif self._wants(frame, pose):
+                report = self._mapper.insert(frame, pose, budget=self._budget())
+            else:
+                continue
+            self._iterations += report.iterations
+            self._keyframes.append(frame)
+        self._iterations += self._mapper.close(budget=self._budget()).iterations
+        return self._keyframes
 
-    def _budget(self, number: int) -> MappingBudget:
+    def _wants(self, frame: Frame, pose: Pose) -> bool:
+        if self._allowance is not None:
+            return frame.index in self._allowance.keyframes
+        return not withheld(frame) and self._mapper.wants(frame, pose)
+
+    def _budget(self) -> MappingBudget:
         if self._allowance is None:
             return MappingBudget()
-        return self._allowance.budget(
-            spent=getattr(self.cost, self._allowance.unit),
-            done=number,
-            frames=len(self._segment.frames),
-            lead=self._lead,
-        )
+        spent = getattr(self.cost, self._allowance.unit)
+        return self._allowance.budget(spent=spent, number=len(self._keyframes))

@@ -49,6 +49,10 @@ class MappingConfig:
     """Optimisation steps on the first keyframe of a sub-map."""
     least_iterations: int = 3
     """Optimisation steps per keyframe that a live agent takes even when it has no time."""
+    closing_iterations: int = 0
+    """Optimisation steps over all keyframes before a finished sub-map is handed over. They sharpen
+    it more than as many steps on the way, but the frame of the hand-over waits for them; a live
+    agent takes those that it has time for."""
     settle: float = 0.01
     """Stop early when an iteration gains less than this share of the loss; 0 never stops early."""
     newest_share: float = 0.4
@@ -103,6 +107,7 @@ class MappingConfig:
         rules = {
             "iterations": (self.iterations >= 1, "expected at least 1"),
             "anchor_iterations": (self.anchor_iterations >= 1, "expected at least 1"),
+            "closing_iterations": (self.closing_iterations >= 0, "expected 0 or more"),
             "least_iterations": (self.least_iterations >= 0, "expected 0 or more"),
             "keyframe_every": (self.keyframe_every >= 0, "expected 0 or more frames"),
             "newest_share": (0.0 <= self.newest_share <= 1.0, "expected 0 to 1"),
@@ -130,6 +135,7 @@ def paper_schedule(config: MappingConfig) -> MappingConfig:
         keyframe_every=5,
         iterations=100,
         anchor_iterations=100,
+        closing_iterations=0,
         settle=0.0,
         seeding="uniform",
         seeds_per_keyframe=60_000,

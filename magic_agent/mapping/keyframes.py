@@ -64,6 +64,10 @@ class Window:
         newest = len(self._losses) - 1
         if newest == 0 or self._rng.random() < self._newest_share:
             return newest
+        return self.choose_any()
+
+    def choose_any(self) -> int:
+        """The same without preference for the newest: for the steps that close a sub-map."""
         neglect = [self._coverage.neglect(index) for index in range(len(self._losses))]
         weights = np.array(self._losses) * np.array(self._waits) * np.array(neglect)
         return int(self._rng.choice(len(weights), p=weights / weights.sum()))

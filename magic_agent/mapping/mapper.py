@@ -63,6 +63,25 @@ class MappingReport:
     """Whether the Gaussians carried over were brought to the exposure of a new anchor."""
 
 
+@dataclass(frozen=True, slots=True)
+class Closing:
+    """What the steps that close a sub-map took."""
+
+    iterations: int = 0
+    cut_iterations: int = 0
+    """Steps of the schedule that the budget's time did not allow."""
+    seconds: float = 0.0
+
+    def added_to(self, report: MappingReport) -> MappingReport:
+        """The report of the keyframe that follows, with these steps in it."""
+        return replace(
+            report,
+            iterations=report.iterations + self.iterations,
+            cut_iterations=report.cut_iterations + self.cut_iterations,
+            duration_ms=report.duration_ms + 1e3 * self.seconds,
+        )
+
+
 _UNBOUNDED = MappingBudget()
 _THIN = 8
 """Every so many pixels of a keyframe tell which surface it covers."""
@@ -198,6 +217,21 @@ class Mapper:
         self._overhead_s = duration_s - (ended - began)
         self._step_s = (ended - began) / max(iterations, 1)
         return MappingReport(seeded, pruned, iterations, cut, loss, len(self), 1e3 * duration_s)
+
+    def close(self, *, budget: MappingBudget = _UNBOUNDED) -> Closing:
+        """Take the closing steps, over all keyframes, before the sub-map is handed over."""
+        wanted = budget.iterations
+        if wanted is None:
+            wanted = self._config.closing_iterations
+        if wanted == 0:
+            return Closing()
+        started, done = self._clock(), 0
+        deadline = math.inf if budget.seconds is None else started + budget.seconds
+        while done < wanted and self._clock() < deadline:
+            self._step(self._window.choose_any())
+            done += 1
+        self._prune()
+        return Closing(done, wanted - done, self._clock() - started)
 
     def split(self, anchor_from_next: Pose) -> tuple[GaussianCloud, GaussianCloud]:
         """(sent, kept): what the next anchor cannot see; what it sees, moved to its frame.

@@ -83,13 +83,21 @@ def test_gains_are_ours_minus_the_papers_at_equal_budget(report):
     )
 
 
-def test_a_budget_is_spread_over_the_frames_and_never_exceeded():
-    allowance = benchmark.Allowance("iterations", 900)
-    first = allowance.budget(spent=0, done=0, frames=45, lead=5)
-    assert first == MappingBudget(iterations=100)
-    assert allowance.budget(spent=100, done=20, frames=45, lead=5).iterations == 400
-    assert allowance.budget(spent=500, done=44, frames=45, lead=5).iterations == 400
-    assert allowance.budget(spent=901, done=44, frames=45, lead=5).iterations == 0
+def test_a_budget_is_spread_over_the_keyframes_and_never_exceeded():
+    allowance = benchmark.Allowance("iterations", 900, keyframes=tuple(range(0, 45, 5)))
+    assert allowance.budget(spent=0, number=0) == MappingBudget(iterations=100)
+    assert allowance.budget(spent=100, number=4).iterations == 400
+    assert allowance.budget(spent=500, number=8).iterations == 400
+    assert allowance.budget(spent=901, number=8).iterations == 0
+    assert allowance.budget(spent=0, number=0).seconds is None
+
+
+def test_what_goes_beyond_a_schedules_own_steps_is_for_closing_the_sub_map():
+    ours = benchmark.Allowance("iterations", 900, keyframes=(0, 7, 9), most_iterations=14)
+    assert [ours.budget(spent=14 * n, number=n).iterations for n in range(4)] == [14, 14, 14, 858]
+    timed = replace(ours, unit="seconds", amount=30.0)
+    assert timed.budget(spent=0.0, number=0) == MappingBudget(iterations=14, seconds=10.0)
+    assert timed.budget(spent=1.0, number=3).seconds == pytest.approx(29.0)
 
 
 def test_true_and_tracked_poses_cut_the_same_sub_maps(recording):

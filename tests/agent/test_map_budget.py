@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from magic_agent.mapping import Mapper, MappingBudget, MappingConfig
 from magic_core.data import Frame
 from magic_core.errors import ConfigError
 from magic_core.geometry import Camera, se3
+from magic_core.submap import Keyframe
 from tests.small_world import look, render
 
 CAMERA = Camera(width=96, height=72, fx=84.0, fy=84.0, cx=47.5, cy=35.5)
@@ -28,6 +32,17 @@ class Clock:
 
 def mapper() -> Mapper:
     return Mapper(CAMERA, CONFIG, threads=1, clock=Clock())
+
+
+def mapper_after_begin() -> Mapper:
+    new = mapper()
+    new.begin(FRAME)
+    return new
+
+
+def colour_error(mapper: Mapper, keyframe: Keyframe) -> float:
+    view = mapper.render(keyframe.anchor_from_camera)
+    return float(np.abs(view.colour - keyframe.colour / 255.0).mean())
 
 
 def test_steps_end_with_the_time_and_the_rest_is_reported_as_cut():
@@ -59,9 +74,34 @@ def test_a_mapper_learns_what_a_keyframe_takes_at_least():
     assert new.least_s == pytest.approx(0.02 + 3 * 0.13 / 12)
 
 
-def test_steps_of_a_negative_number_are_refused():
-    with pytest.raises(ConfigError, match=r"mapping\.least_iterations"):
-        MappingConfig(least_iterations=-1).resolved()
+@pytest.mark.parametrize("name", ["least_iterations", "closing_iterations"])
+def test_steps_of_a_negative_number_are_refused(name):
+    with pytest.raises(ConfigError, match=rf"mapping\.{name}"):
+        replace(MappingConfig(), **{name: -1}).resolved()
+
+
+def test_closing_takes_its_steps_as_far_as_the_time_goes():
+    config = replace(CONFIG, closing_iterations=30)
+    new = Mapper(CAMERA, config, threads=1, clock=Clock())
+    opening = new.begin(FRAME)
+    short = new.close(budget=MappingBudget(seconds=0.055))
+    assert (short.iterations, short.cut_iterations) == (5, 25)
+    report = short.added_to(opening)
+    assert (report.iterations, report.cut_iterations) == (17, 25)
+    assert new.close(budget=MappingBudget(seconds=-1.0)).iterations == 0
+    assert new.close().iterations == 30
+    assert mapper_after_begin().close().iterations == 0  # unless it is asked for
+
+
+def test_closing_sharpens_all_keyframes_of_a_sub_map():
+    second = look(-0.8, -0.8, 0.4)
+    pose = se3.inverse(look(-0.8, -0.8, 0.2)) @ second
+    new = mapper_after_begin()
+    new.insert(Frame(5, 0.2, *render(CAMERA, second)), pose)
+    before = [colour_error(new, keyframe) for keyframe in new.keyframes]
+    new.close(budget=MappingBudget(iterations=60))
+    after = [colour_error(new, keyframe) for keyframe in new.keyframes]
+    assert all(late < 0.9 * early for early, late in zip(before, after, strict=True))
 
 
 def test_a_keyframe_may_be_judged_by_a_view_rendered_before():
