@@ -1,17 +1,21 @@
-"""MkDocs hook: the service's reference page, made from the comments of the .proto files."""
+"""MkDocs hooks: reference pages of the service, from its .proto files, and of the commands."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from google.protobuf import descriptor_pb2
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = "api/service.md"
+SERVICE_PAGE, COMMANDS_PAGE = "api/service.md", "api/commands.md"
 _MESSAGE, _ENUM, _SERVICE, _FIELD, _METHOD, _VALUE = 4, 5, 6, 2, 2, 2
 _SCALARS = {
     value: name.removeprefix("TYPE_").lower()
@@ -20,10 +24,29 @@ _SCALARS = {
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """Fill the page that stands for the contract."""
-    if page.file.src_uri != PAGE:
+    """Fill the pages that stand for the contract and for the command line."""
+    if page.file.src_uri == SERVICE_PAGE:
+        lines = [line for file in contract().file for line in describe(file)]
+    elif page.file.src_uri == COMMANDS_PAGE:
+        lines = list(commands())
+    else:
         return markdown
-    return markdown + "\n" + "\n".join(line for file in contract().file for line in describe(file))
+    return markdown + "\n" + "\n".join(lines)
+
+
+def commands() -> Iterator[str]:
+    """The help of every command, as a terminal shows it."""
+    from magic_cli.main import COMMANDS, run_command
+
+    for name, (module, summary) in COMMANDS.items():
+        nested = getattr(importlib.import_module(module), "BENCHMARKS", {})
+        yield f"## magic {name}\n\n{summary[0].upper()}{summary[1:]}.\n"
+        for words in ([name], *([name, inner] for inner in nested)):
+            text = io.StringIO()
+            with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+                run_command([*words, "--help"])
+            lines = "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+            yield f"```text\n$ magic {' '.join(words)} --help\n{lines.strip()}\n```\n"
 
 
 def contract() -> descriptor_pb2.FileDescriptorSet:

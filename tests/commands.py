@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 from typing import Any
 from unittest import mock
 
@@ -36,3 +39,22 @@ def parse_command(arguments: list[str]) -> object:
             code = end.code
     assert code == 0, f"magic {' '.join(arguments)}: exit code {code}"
     return None
+
+
+def options_of(*command: str) -> set[str]:
+    """Every option that a command has, the settings of its parts included."""
+    found: set[str] = set()
+    real = tyro.cli
+
+    def read(cls: type, *_: Any, **options: Any) -> None:
+        for name in ("prog", "description", "args"):
+            options.pop(name, None)
+        text = io.StringIO()
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            real(cls, args=["--help"], **options)
+        found.update(re.findall(r"(?<!\S)--[a-z][\w.-]*", text.getvalue()))
+        raise _Parsed(cls)
+
+    with mock.patch.object(tyro, "cli", read), contextlib.suppress(_Parsed):
+        run_command([*command, "--help-all"])
+    return found
