@@ -20,6 +20,7 @@
     │   └── PlaintextRefused        UNAUTHENTICATED      what came unencrypted must be encrypted
     ├── PermissionDenied            PERMISSION_DENIED    a caller that is known may not do this
     ├── Unavailable                 UNAVAILABLE          try again later
+    │   └── HeldElsewhere           UNAVAILABLE          another server works on the session
     ├── DeadlineExceeded            DEADLINE_EXCEEDED    the answer did not come in time
     └── NotSupported                UNIMPLEMENTED        this build or version cannot do it
 
@@ -161,6 +162,34 @@ class PermissionDenied(MagicError):
 class Unavailable(MagicError):
     grpc_code = "UNAVAILABLE"
     reason = "UNAVAILABLE"
+
+
+class HeldElsewhere(Unavailable):
+    reason = "HELD_ELSEWHERE"
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        holder: str = "",
+        violations: tuple[FieldViolation, ...] = (),
+        retry_after_s: float | None = None,
+    ) -> None:
+        """`holder` is the HOST:PORT of the server to ask instead; empty while nobody has it."""
+        super().__init__(message, violations=violations, retry_after_s=retry_after_s)
+        self.holder = holder
+
+    def __reduce__(self):
+        return _rebuild_held, (self.message, self.holder, self.violations, self.retry_after_s)
+
+
+def _rebuild_held(
+    message: str,
+    holder: str,
+    violations: tuple[FieldViolation, ...],
+    retry_after_s: float | None,
+) -> HeldElsewhere:
+    return HeldElsewhere(message, holder=holder, violations=violations, retry_after_s=retry_after_s)
 
 
 class DeadlineExceeded(MagicError):

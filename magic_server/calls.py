@@ -6,7 +6,7 @@ import contextlib
 import logging
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 WATCHES = frozenset(("/magicslam.v1.MappingService/WatchCorrectedPoses",))
 """Calls that last as long as their caller wants; they have places of their own."""
 _KINDS = ("session", "agent", "submap")
+Route = Callable[[str, str], Awaitable[None]]
+"""Called with a method and the name of a resource."""
 
 
 @dataclass(slots=True)
@@ -72,6 +74,12 @@ class Call:
         assert self.principal is not None  # set before a request is read
         self.desk.access.require(self.principal, self.method, request)
 
+    async def require_here(self) -> None:
+        """Raise HeldElsewhere where another server works on what the call is about."""
+        if self.desk.route is not None:
+            for name in self.resources:
+                await self.desk.route(self.method, name)
+
     def count(self, answer: Any) -> None:
         """Count what an answer says was stored."""
         if isinstance(answer, mapping_pb.SubmitSubmapResponse) and not answer.duplicate:
@@ -85,6 +93,7 @@ class Call:
             if first or resources_of(self.rule, request):
                 self.note(request)
                 self.authorise(request)
+                await self.require_here()
                 first = False
             if _has(request, "chunk"):
                 self.desk.metrics.received_bytes.inc(len(request.chunk.data))
@@ -103,8 +112,11 @@ class CallDesk:
         resources: Resources,
         metrics: Metrics,
         audit: AuditLog,
+        route: Route | None = None,
     ) -> None:
+        """`route` raises for what another server has to be asked; None where there is no other."""
         self.access = access
+        self.route = route
         self.metrics = metrics
         self._gate = gate
         self._quotas = quotas
@@ -134,6 +146,7 @@ class CallDesk:
                         await self._resources.require(0)
                     if request is not None:
                         call.authorise(request)
+                        await call.require_here()
                     yield call
         except MagicError as error:
             await self._write_audit(call)

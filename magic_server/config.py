@@ -11,6 +11,7 @@ from magic_core.tracing import TracingConfig
 from magic_core.wire import SubmapLimits, Transport
 from magic_server.access import AccessConfig
 from magic_server.audit import AuditConfig
+from magic_server.cluster_config import ClusterConfig
 from magic_server.globalmap import MergeConfig
 from magic_server.health_port import HealthPortConfig
 from magic_server.jobs import JobConfig
@@ -22,6 +23,7 @@ from magic_server.probes import MetricsConfig
 from magic_server.quotas import QuotaConfig
 from magic_server.registration import RegistrationConfig
 from magic_server.resources import ResourceConfig
+from magic_server.store_config import StoreConfig
 from magic_server.tls import TlsConfig
 from magic_server.upload_config import PartialUploadLimits
 
@@ -84,6 +86,8 @@ class ServerConfig:
 
     data_dir: Path = Path("magic-data")
     """Folder of the store; it is created."""
+    store: StoreConfig = field(default_factory=StoreConfig)
+    cluster: ClusterConfig = field(default_factory=ClusterConfig)
     listen: ListenConfig = field(default_factory=ListenConfig)
     tls: TlsConfig = field(default_factory=TlsConfig)
     access: AccessConfig = field(default_factory=AccessConfig)

@@ -66,7 +66,7 @@ class Previews:
     ) -> None:
         self._store, self._sessions = store, sessions
         self._jobs, self._threads, self._config = jobs, threads, config
-        self._root = store.folder / _FOLDER
+        self._root = store.scratch / _FOLDER
         self._last: dict[int, _Preview] = {}
         self._locks: dict[int, asyncio.Lock] = {}
         self._seen: dict[int, int] = {}

@@ -37,11 +37,15 @@ class Sessions:
         self._metrics = metrics
         self._coordinators: dict[str, SessionCoordinator] = {}
         self._lock = asyncio.Lock()
+        # Sub-maps that were stored while a session's coordinator was reading the store.
+        self._late: dict[str, list[Vertex]] = {}
 
-    async def start(self) -> None:
-        """Take up every stored session."""
+    async def start(self, *, everything: bool = True) -> None:
+        """Take up every stored session, unless they are taken one by one."""
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._threads, _load_libraries, self._config)
+        if not everything:
+            return
         for session in await self._store.agents.sessions():
             await self.coordinator(session)
 
@@ -87,9 +91,31 @@ class Sessions:
                     config=self._config,
                     metrics=self._metrics,
                 )
-                await found.start()
+                late = self._late.setdefault(session.name, [])
+                try:
+                    await found.start()
+                finally:
+                    del self._late[session.name]
                 self._coordinators[session.name] = found
+                for vertex in late:
+                    if vertex.name not in found.graph:
+                        found.submap_stored(vertex)
             return found
+
+    def found(self, session: str) -> SessionCoordinator | None:
+        """The coordinator of a session's id that is at work, or None."""
+        return self._coordinators.get(session)
+
+    async def dismiss(self, session: int, reason: MagicError) -> SessionRow | None:
+        """Work no more on a session, by row id; those who watch it are sent away with `reason`."""
+        async with self._lock:
+            for name, found in self._coordinators.items():
+                if found.session.id == session:
+                    del self._coordinators[name]
+                    await found.close()
+                    found.board.close(reason)
+                    return found.session
+        return None
 
     @asynccontextmanager
     async def forgotten(self, session: SessionRow, reason: MagicError) -> AsyncIterator[None]:
@@ -115,6 +141,8 @@ class Sessions:
         # Without one its session is being deleted, or begun again once that has failed.
         if found := self._coordinators.get(agent.session.name):
             found.submap_stored(vertex)
+        elif agent.session.name in self._late:
+            self._late[agent.session.name].append(vertex)
 
     async def named(self, session: str) -> SessionCoordinator:
         """The coordinator of a session's id; NotFound when there is no such session."""

@@ -11,7 +11,7 @@ from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
 from magic_core import errors
-from magic_core.errors import FieldViolation, MagicError
+from magic_core.errors import FieldViolation, HeldElsewhere, MagicError
 
 DOMAIN = "magicslam"
 MAX_DETAIL_CHARACTERS = 2000
@@ -19,8 +19,13 @@ _BREAKS = ("Internal error from Core", "Received RST_STREAM", "RST_STREAM", "Str
 
 
 def status_of(error: MagicError) -> status_pb2.Status:
-    """A google.rpc.Status with ErrorInfo; BadRequest for violated fields, RetryInfo for a wait."""
+    """A google.rpc.Status with ErrorInfo; BadRequest for violated fields, RetryInfo for a wait.
+
+    The ErrorInfo of HELD_ELSEWHERE names the server to ask instead: metadata `holder`.
+    """
     info = error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN)
+    if isinstance(error, HeldElsewhere) and error.holder:
+        info.metadata["holder"] = error.holder
     details = [_packed(info)]
     if error.violations:
         bad = error_details_pb2.BadRequest()
@@ -49,12 +54,16 @@ def error_of(call: grpc.RpcError) -> MagicError:
     """The error that a failed call stands for: by its ErrorInfo reason, else by its gRPC code."""
     code: grpc.StatusCode = call.code()  # type: ignore[attr-defined]
     message = call.details() or code.name  # type: ignore[attr-defined]
-    reason, violations, retry_after_s = _details(call)
+    reason, violations, retry_after_s, holder = _details(call)
     kind = error_class(reason, code.name)
     if reason is None and _is_broken(code.name, message):
         kind = errors.Unavailable
     if kind is MagicError and reason is None:
         message = f"{code.name}: {message}"
+    if kind is HeldElsewhere:
+        return HeldElsewhere(
+            message, holder=holder, violations=violations, retry_after_s=retry_after_s
+        )
     return kind(message, violations=violations, retry_after_s=retry_after_s)
 
 
@@ -70,23 +79,24 @@ def error_class(reason: str | None, code: str) -> type[MagicError]:
 
 def _details(
     call: grpc.RpcError,
-) -> tuple[str | None, tuple[FieldViolation, ...], float | None]:
-    """(ErrorInfo reason, violated fields, seconds to wait), as far as the status says."""
-    reason, violations, retry_after_s = None, (), None
+) -> tuple[str | None, tuple[FieldViolation, ...], float | None, str]:
+    """(ErrorInfo reason, violated fields, seconds to wait, the server to ask instead), as far as
+    the status says."""
+    reason, violations, retry_after_s, holder = None, (), None, ""
     status = _rich_status(call)
     for detail in status.details if status is not None else ():
         info, bad = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
         retry = error_details_pb2.RetryInfo()
         with contextlib.suppress(DecodeError):
             if detail.Unpack(info) and info.domain == DOMAIN:
-                reason = info.reason
+                reason, holder = info.reason, info.metadata.get("holder", "")
             elif detail.Unpack(bad):
                 violations = tuple(
                     FieldViolation(v.field, v.description) for v in bad.field_violations
                 )
             elif detail.Unpack(retry):
                 retry_after_s = max(0.0, retry.retry_delay.ToNanoseconds() / 1e9)
-    return reason, violations, retry_after_s
+    return reason, violations, retry_after_s, holder
 
 
 def _rich_status(call: grpc.RpcError) -> status_pb2.Status | None:

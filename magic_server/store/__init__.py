@@ -1,10 +1,11 @@
-"""What a server remembers: SQLite beside a content-addressed blob folder."""
+"""What a server remembers: a database beside a content-addressed blob folder."""
 
 from magic_server.store.agents import Registration, require_model
 from magic_server.store.answers import Asked
 from magic_server.store.archive import ImportedSubmap, archive_of
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
+from magic_server.store.leases import LeaseTable
 from magic_server.store.maps import NewMap, OpenOperation
 from magic_server.store.rows import (
     AgentRow,
@@ -28,6 +29,7 @@ __all__ = [
     "DeletionRequest",
     "FirstAnswer",
     "ImportedSubmap",
+    "LeaseTable",
     "MapFile",
     "NewMap",
     "NewSolution",

@@ -14,6 +14,7 @@ from magic_core.wire.convert import moment
 from magic_server.store import answers
 from magic_server.store.answers import Asked
 from magic_server.store.database import Database
+from magic_server.store.engines import greatest, total
 from magic_server.store.rows import AgentRow, SessionRow
 from magic_server.store.schema import agents, loops, removed_submaps, sessions, snapshots, submaps
 
@@ -45,7 +46,7 @@ class AgentTable:
         when the agent has finished, AlreadyExists when the request id was used for another request.
         """
         async with self._database.write() as connection:
-            pinned = await _pinned_session(
+            pinned = await self._pinned_session(
                 connection, session, model_id=model_id, dimension=dimension, now=asked.now
             )
             found = await _find_agent(connection, pinned, agent)
@@ -73,7 +74,7 @@ class AgentTable:
     async def finish(self, session: str, agent: str, *, asked: Asked) -> int:
         """Mark an agent as done; returns its number of sub-maps. A repeat gets the first answer."""
         found = await self.agent(session, agent)
-        async with self._database.write() as connection:
+        async with self._database.write(found.session.id) as connection:
             if (first := await answers.first_answer(connection, found.id, asked)) is not None:
                 return first["submap_count"]
             change = sa.update(agents).where(agents.c.id == found.id)
@@ -85,11 +86,15 @@ class AgentTable:
 
     async def session(self, session: str) -> SessionRow:
         """A session; NotFound when there is none of that name."""
-        async with self._database.read() as connection:
-            found = await _find_session(connection, session)
+        found = await self.find(session)
         if found is None:
             raise NotFound(f"{names.session_name(session)} does not exist; register an agent first")
         return found
+
+    async def find(self, session: str) -> SessionRow | None:
+        """A session, or None when there is none of that name."""
+        async with self._database.read() as connection:
+            return await _find_session(connection, session)
 
     async def agent(self, session: str, agent: str) -> AgentRow:
         """An agent; NotFound when there is none of that name."""
@@ -152,24 +157,33 @@ class AgentTable:
         rows, following = await self._page(query.order_by(agents.c.id), limit)
         return [_agent_info(session.name, row) for row in rows], following
 
+    async def _pinned_session(
+        self,
+        connection: AsyncConnection,
+        session: str,
+        *,
+        model_id: str,
+        dimension: int,
+        now: float,
+    ) -> SessionRow:
+        """The session, begun with this encoder where it is new."""
+        await self._database.lock_name(connection, session)
+        found = await _find_session(connection, session)
+        if found is not None:
+            await self._database.require(connection, found.id)
+            require_model(found, model_id, dimension)
+            return found
+        values = {"name": session, "created_at": now, "model_id": model_id, "dimension": dimension}
+        added = await connection.execute(sa.insert(sessions), values)
+        begun = SessionRow(_new_id(added), session, model_id, dimension)
+        await self._database.began(connection, begun.id)
+        return begun
+
     async def _page(self, query: sa.Select, limit: int) -> tuple[Sequence[sa.Row], int | None]:
         async with self._database.read() as connection:
             rows = (await connection.execute(query.limit(limit + 1))).all()
         following = rows[limit - 1].id if len(rows) > limit else None
         return rows[:limit], following
-
-
-async def _pinned_session(
-    connection: AsyncConnection, session: str, *, model_id: str, dimension: int, now: float
-) -> SessionRow:
-    """The session, begun with this encoder where it is new."""
-    found = await _find_session(connection, session)
-    if found is None:
-        values = {"name": session, "created_at": now, "model_id": model_id, "dimension": dimension}
-        added = await connection.execute(sa.insert(sessions), values)
-        return SessionRow(_new_id(added), session, model_id, dimension)
-    require_model(found, model_id, dimension)
-    return found
 
 
 def require_model(session: SessionRow, model_id: str, dimension: int) -> None:
@@ -218,7 +232,7 @@ def _last_number(agent: int | sa.Column) -> sa.ColumnElement[int]:
         )
         for table in (submaps, removed_submaps)
     ]
-    return sa.func.max(*highest)
+    return greatest(*highest)
 
 
 def _count(column: sa.Column) -> sa.ScalarSelect:
@@ -226,8 +240,7 @@ def _count(column: sa.Column) -> sa.ScalarSelect:
 
 
 def _sum_of_bytes(condition: sa.ColumnElement[bool]) -> sa.ScalarSelect:
-    total = sa.func.coalesce(sa.func.sum(submaps.c.stored_bytes), 0)
-    return sa.select(total).where(condition).scalar_subquery()
+    return sa.select(total(submaps.c.stored_bytes)).where(condition).scalar_subquery()
 
 
 def _new_id(result: sa.CursorResult) -> int:

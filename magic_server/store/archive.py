@@ -66,6 +66,7 @@ class ArchiveTable:
         """All of a session at one instant; NotFound without it."""
         # As a writer, so that nothing changes between the queries.
         async with self._database.write() as connection:
+            await self._database.freeze(connection)
             query = sa.select(sessions).where(sessions.c.name == session)
             row = (await connection.execute(query)).one_or_none()
             if row is None:
@@ -106,12 +107,14 @@ class ArchiveTable:
         info = convert.session_from_proto(archive.session)
         name = names.parse_session(info.name)
         async with self._database.write() as connection:
+            await self._database.lock_name(connection, name)
             taken = sa.select(sessions.c.id).where(sessions.c.name == name)
             if await connection.scalar(taken) is not None:
                 raise AlreadyExists(f"{info.name} exists already; delete it before importing it")
             values = {"name": name, "created_at": info.created_at.timestamp()}
             values |= {"model_id": info.descriptor_model_id, "dimension": info.descriptor_dimension}
             session_id = await _insert(connection, sessions, values)
+            await self._database.began(connection, session_id)
             row = SessionRow(session_id, name, info.descriptor_model_id, info.descriptor_dimension)
             owners = await _insert_agents(connection, archive, session_id)
             for one in imported:

@@ -26,9 +26,10 @@ DISK_RETRY_S = 15.0
 class BlobFolder:
     """Files named by the SHA-256 of their content."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, scratch: Path | None = None) -> None:
+        """`scratch`: a folder on the same disk for what is being written, else the same one."""
         self.blobs = root / "blobs"
-        self.incoming = root / "incoming"
+        self.incoming = (scratch or root) / "incoming"
 
     def open(self) -> None:
         """Create the folders and drop what a dead server was writing."""
@@ -93,6 +94,19 @@ class BlobFolder:
                 return file.read(length)
         except FileNotFoundError:
             raise NotFound("what is being read has been deleted") from None
+
+
+class SharedBlobFolder(BlobFolder):
+    """A folder that other servers write to as well.
+
+    Any of them may have come to rely on a blob, so none is taken back when a transaction fails, or
+    is not known to have failed: what nothing refers to is collected later, see `CommitLock`.
+    """
+
+    def adopt(self, written: Iterable[BlobWriter]) -> list[str]:
+        """Move complete blobs to their places, durably. Nothing is to be taken back."""
+        super().adopt(written)
+        return []
 
 
 class BlobWriter:

@@ -1,83 +1,101 @@
-"""The database: one SQLite file in WAL mode, every commit on disk before it returns."""
+"""The database: transactions on whichever engine the store has."""
 
 from __future__ import annotations
 
 import asyncio
-import sqlite3
-from collections.abc import AsyncIterator
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import Any
+from typing import Protocol
 
-import sqlalchemy as sa
-from sqlalchemy import event
-from sqlalchemy.exc import OperationalError
-from sqlalchemy.ext.asyncio import AsyncConnection, create_async_engine
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import DiskFull, WrongState
-from magic_server.store import schema
-from magic_server.store.blobs import DISK_RETRY_S
+from magic_server.store import migrations
+from magic_server.store.engines import Engine
 
-# A full disk shows as either, depending on which file had to grow.
-_NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_SHMSIZE)
+
+class Fence(Protocol):
+    """Keeps writes about a session with the server that holds it."""
+
+    async def add(self, connection: AsyncConnection, session: int) -> None:
+        """This server holds a session that begins in this transaction."""
+        ...
+
+    async def require(self, connection: AsyncConnection, session: int) -> None:
+        """Raise unless this server holds the session, and see that it does until the commit."""
+        ...
 
 
 class Database:
-    """Connections to the store's database; one writer at a time, many readers."""
+    """Connections to the store's database; one writer at a time, many readers.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._engine = create_async_engine(f"sqlite+aiosqlite:///{path}", pool_size=4)
-        self._write_lock = asyncio.Lock()
-        event.listen(self._engine.sync_engine, "connect", _prepare_connection)
+    Where several servers share it a session has one writer at a time.
+    """
 
-    async def open(self) -> None:
-        """Create the tables where they are missing; WrongState for another schema version."""
-        async with self._engine.begin() as connection:
-            await connection.run_sync(schema.metadata.create_all)
-            found = await connection.scalar(sa.select(schema.schema_version.c.version))
-            if found is None:
-                version = {"version": schema.SCHEMA_VERSION}
-                await connection.execute(sa.insert(schema.schema_version), version)
-        if found not in (None, schema.SCHEMA_VERSION):
-            raise WrongState(
-                f"{self.path} has schema version {found}, this build needs "
-                f"{schema.SCHEMA_VERSION}; use the version of magic-slam that wrote it"
-            )
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self.fence: Fence | None = None
+        self._write_lock = contextlib.nullcontext() if engine.shared else asyncio.Lock()
+
+    async def open(self, *, first: Callable[[AsyncConnection], Awaitable[None]]) -> None:
+        """Bring the tables to what this build knows, and do something `first` with them.
+
+        WrongState for tables of a later build.
+        """
+        with self._translated():
+            async with self.engine.pool.begin() as connection:
+                await self.engine.lock_schema(connection)
+                await migrations.upgrade(connection, self.engine.place)
+                await first(connection)
 
     async def close(self) -> None:
         """Close every connection."""
-        await self._engine.dispose()
+        await self.engine.pool.dispose()
 
     @asynccontextmanager
     async def read(self) -> AsyncIterator[AsyncConnection]:
         """A connection for reading."""
-        async with self._engine.connect() as connection:
-            yield connection
+        with self._translated():
+            async with self.engine.pool.connect() as connection:
+                yield connection
 
     @asynccontextmanager
-    async def write(self) -> AsyncIterator[AsyncConnection]:
+    async def write(self, *sessions: int) -> AsyncIterator[AsyncConnection]:
         """One transaction: durable when the block ends, undone when it raises.
 
-        Raises DiskFull when the disk has no room for it.
+        `sessions` are the row ids of those it is about: HeldElsewhere where another server has
+        one of them. Raises DiskFull when the disk has no room for it.
         """
-        try:
-            async with self._write_lock, self._engine.begin() as connection:
+        with self._translated():
+            async with self._write_lock, self.engine.pool.begin() as connection:
+                for session in sorted(sessions):  # in one order: nobody waits in a circle
+                    await self.require(connection, session)
                 yield connection
-        except OperationalError as error:
-            if getattr(error.orig, "sqlite_errorcode", None) in _NO_ROOM:
-                message = "the server's disk is full; try again once there is room"
-                raise DiskFull(message, retry_after_s=DISK_RETRY_S) from error
+
+    async def require(self, connection: AsyncConnection, session: int) -> None:
+        """Within a transaction: raise unless this server may write about a session."""
+        if self.fence is not None:
+            await self.fence.require(connection, session)
+
+    async def freeze(self, connection: AsyncConnection) -> None:
+        """At the start of a transaction: its queries all see the same instant."""
+        await self.engine.freeze(connection)
+
+    async def lock_name(self, connection: AsyncConnection, session: str) -> None:
+        """Within a transaction: nobody else begins a session of this name meanwhile."""
+        await self.engine.lock_name(connection, session)
+
+    async def began(self, connection: AsyncConnection, session: int) -> None:
+        """Within the transaction that begins a session: this server has it."""
+        if self.fence is not None:
+            await self.fence.add(connection, session)
+
+    @contextlib.contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except (SQLAlchemyError, OSError) as error:
+            if (meaning := self.engine.error_of(error)) is not None:
+                raise meaning from error
             raise
-
-
-def _prepare_connection(connection: Any, _record: Any) -> None:
-    cursor = connection.cursor()
-    for pragma in (
-        "journal_mode = WAL",
-        "synchronous = FULL",  # a commit in WAL mode is only durable with this
-        "foreign_keys = ON",
-        "busy_timeout = 10000",
-    ):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()

@@ -12,6 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from magic_core.errors import NotFound
 from magic_server.store.blobs import BlobFolder
+from magic_server.store.commit_lock import CommitLock
 from magic_server.store.database import Database
 from magic_server.store.rows import AgentRow, SessionRow
 from magic_server.store.schema import (
@@ -65,7 +66,7 @@ class Deletions:
     """Takes things out of the store; nothing else can be added meanwhile."""
 
     def __init__(
-        self, database: Database, blobs: BlobFolder, *, lock: asyncio.Lock, threads: Executor
+        self, database: Database, blobs: BlobFolder, *, lock: CommitLock, threads: Executor
     ) -> None:
         self._database = database
         self._blobs = blobs
@@ -86,8 +87,8 @@ class Deletions:
     ) -> Deleted:
         """Delete one sub-map; what its neighbours need of it is kept."""
         which = sa.and_(submaps.c.agent_id == agent.id, submaps.c.number == index)
-        async with self._lock:
-            async with self._database.write() as connection:
+        async with self._lock.alone():
+            async with self._database.write(agent.session.id) as connection:
                 digests = await _blobs_of(connection, which)
                 if not digests:
                     raise NotFound(f"{request.name} is not stored")
@@ -106,8 +107,8 @@ class Deletions:
     ) -> Deleted:
         """Delete an agent with all of its sub-maps; its name is free again."""
         which = submaps.c.agent_id == agent.id
-        async with self._lock:
-            async with self._database.write() as connection:
+        async with self._lock.alone():
+            async with self._database.write(agent.session.id) as connection:
                 if not await _exists(connection, agent):
                     raise NotFound(f"{request.name} does not exist")
                 count = await _count(connection, which)
@@ -127,8 +128,8 @@ class Deletions:
     async def session(self, session: SessionRow, request: DeletionRequest) -> Deleted:
         """Delete a session with all it holds; its name is free again."""
         which = submaps.c.session_id == session.id
-        async with self._lock:
-            async with self._database.write() as connection:
+        async with self._lock.alone():
+            async with self._database.write(session.id) as connection:
                 count = await _count(connection, which)
                 digests = await _blobs_of(connection, which)
                 mine = sa.select(maps.c.id).where(maps.c.session_id == session.id)

@@ -42,7 +42,7 @@ class LoopTable:
         searched = sa.update(submaps).where(
             submaps.c.agent_id == mine.scalar_subquery(), submaps.c.number == index
         )
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             await connection.execute(searched.values(searched=True))
             if candidates:
                 rows = [loop_columns(loop) | {"session_id": session.id} for loop in candidates]
@@ -50,7 +50,7 @@ class LoopTable:
 
     async def settle(self, session: SessionRow, loop: records.LoopCandidate) -> None:
         """Store what verification found about a candidate."""
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             change = sa.update(loops).where(
                 loops.c.session_id == session.id,
                 loops.c.source == loop.source,
@@ -110,7 +110,7 @@ class LoopTable:
         row = {"session_id": session.id, "revision": revision, "snapshot": snapshot}
         row["settled"] = settled
         mine = loops.c.session_id == session.id
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             await connection.execute(
                 sa.delete(snapshots).where(snapshots.c.session_id == session.id)
             )
@@ -143,7 +143,7 @@ class LoopTable:
         `taken_up` and `dropped` hold the (source, target) of loops it newly relies on, or no more.
         """
         row = {"session_id": session.id, "revision": revision, "change": change}
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             await connection.execute(sa.insert(snapshot_changes), row)
             whole = sa.update(snapshots).where(snapshots.c.session_id == session.id)
             await connection.execute(whole.values(revision=revision, settled=settled))

@@ -63,7 +63,7 @@ class MapTable:
         same = sa.select(operations.c.id, operations.c.request).where(
             operations.c.session_id == session.id, operations.c.request_id == request.request_id
         )
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             found = (await connection.execute(same)).one_or_none()
             if found is not None:
                 if map_pb.BuildGlobalMapRequest.FromString(found.request) != request:
@@ -94,6 +94,7 @@ class MapTable:
         """Store how far an operation is."""
         values = {"state": state, "progress": progress, "stage": stage, "updated_at": now}
         async with self._database.write() as connection:
+            await self._require_holder(connection, operation)
             await _update(connection, operation, values)
 
     async def fail(self, operation: int, error: MagicError, *, now: float) -> None:
@@ -106,6 +107,7 @@ class MapTable:
             "updated_at": now,
         }
         async with self._database.write() as connection:
+            await self._require_holder(connection, operation)
             await _update(connection, operation, values)
 
     async def succeed(
@@ -123,7 +125,7 @@ class MapTable:
             "gaussian_count": made.gaussian_count,
             "created_at": now,
         }
-        async with self._database.write() as connection:
+        async with self._database.write(session.id) as connection:
             await _require_submaps(connection, session, made.submaps)
             added = await connection.execute(sa.insert(maps), row)
             key = added.inserted_primary_key
@@ -136,6 +138,11 @@ class MapTable:
             done = {"state": "SUCCEEDED", "progress": 1.0, "stage": "done"}
             values = done | {"map_id": key[0], "updated_at": now}
             await _update(connection, operation, values)
+
+    async def _require_holder(self, connection: AsyncConnection, operation: int) -> None:
+        query = sa.select(operations.c.session_id).where(operations.c.id == operation)
+        if (session := await connection.scalar(query)) is not None:
+            await self._database.require(connection, session)
 
     async def unfinished(self) -> list[OpenOperation]:
         """Every operation that is not done, oldest first."""

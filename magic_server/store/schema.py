@@ -1,30 +1,36 @@
-"""Tables of the store. Names of columns are the facts; everything binary is little-endian."""
+"""Tables of the store. Names of columns are the facts; everything binary is little-endian.
+
+A change here needs a revision under `migrations/versions`, for both engines.
+"""
 
 from __future__ import annotations
 
 import sqlalchemy as sa
 
-SCHEMA_VERSION = 1
-
 metadata = sa.MetaData()
 
+# SQLite's integers have 64 bits under any name, and only INTEGER counts up by itself there.
+INTEGER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+
+# What builds from before the revisions look at; it stays 1 for as long as they can use the tables.
+SCHEMA_VERSION = 1
 schema_version = sa.Table("schema_version", metadata, sa.Column("version", sa.Integer))
 
 sessions = sa.Table(
     "sessions",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("name", sa.String(63), nullable=False, unique=True),
     sa.Column("created_at", sa.Float, nullable=False),  # seconds since 1970, UTC
     sa.Column("model_id", sa.String(128), nullable=False),
-    sa.Column("dimension", sa.Integer, nullable=False),
+    sa.Column("dimension", INTEGER, nullable=False),
     sqlite_autoincrement=True,  # what was deleted is never mistaken for what came after it
 )
 
 agents = sa.Table(
     "agents",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
     sa.Column("name", sa.String(63), nullable=False),
     sa.Column("finished", sa.Boolean, nullable=False),
@@ -37,23 +43,23 @@ agents = sa.Table(
 submaps = sa.Table(
     "submaps",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),  # grows with the order of arrival
+    sa.Column("id", INTEGER, primary_key=True),  # grows with the order of arrival
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
     sa.Column("agent_id", sa.ForeignKey("agents.id"), nullable=False),
-    sa.Column("number", sa.Integer, nullable=False),  # index within the agent
+    sa.Column("number", INTEGER, nullable=False),  # index within the agent
     sa.Column("request_id", sa.String(128), nullable=False),
     sa.Column("header_sha256", sa.LargeBinary(32), nullable=False),
     sa.Column("header", sa.LargeBinary, nullable=False),  # magicslam.v1.SubmapHeader
     sa.Column("received_at", sa.Float, nullable=False),
     sa.Column("first_timestamp_s", sa.Float, nullable=False),
     sa.Column("last_timestamp_s", sa.Float, nullable=False),
-    sa.Column("frame_count", sa.Integer, nullable=False),
-    sa.Column("keyframe_count", sa.Integer, nullable=False),
-    sa.Column("gaussian_count", sa.Integer, nullable=False),
-    sa.Column("stored_bytes", sa.Integer, nullable=False),
+    sa.Column("frame_count", INTEGER, nullable=False),
+    sa.Column("keyframe_count", INTEGER, nullable=False),
+    sa.Column("gaussian_count", INTEGER, nullable=False),
+    sa.Column("stored_bytes", INTEGER, nullable=False),
     # What the index and the pose graph need, so that a restart parses no header.
     sa.Column("descriptor", sa.LargeBinary, nullable=False),  # float32 (d,)
-    sa.Column("previous_number", sa.Integer),
+    sa.Column("previous_number", INTEGER),
     sa.Column("previous_from_anchor", sa.LargeBinary),  # float64 (4, 4)
     sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
     sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
@@ -68,13 +74,13 @@ removed_submaps = sa.Table(
     "removed_submaps",
     metadata,
     sa.Column("agent_id", sa.ForeignKey("agents.id"), primary_key=True),
-    sa.Column("number", sa.Integer, primary_key=True),
+    sa.Column("number", INTEGER, primary_key=True),
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
     sa.Column("request_id", sa.String(128), nullable=False),
     sa.Column("header_sha256", sa.LargeBinary(32), nullable=False),
     sa.Column("received_at", sa.Float, nullable=False),
-    sa.Column("stored_bytes", sa.Integer, nullable=False),
-    sa.Column("previous_number", sa.Integer),
+    sa.Column("stored_bytes", INTEGER, nullable=False),
+    sa.Column("previous_number", INTEGER),
     sa.Column("previous_from_anchor", sa.LargeBinary),  # float64 (4, 4)
     sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
     sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
@@ -86,8 +92,8 @@ deletions = sa.Table(
     metadata,
     sa.Column("name", sa.String, primary_key=True),  # resource name
     sa.Column("request_id", sa.String(128), primary_key=True),
-    sa.Column("submap_count", sa.Integer, nullable=False),
-    sa.Column("freed_bytes", sa.Integer, nullable=False),
+    sa.Column("submap_count", INTEGER, nullable=False),
+    sa.Column("freed_bytes", INTEGER, nullable=False),
     sa.Column("deleted_at", sa.Float, nullable=False),
 )
 
@@ -95,7 +101,7 @@ deletions = sa.Table(
 answers = sa.Table(
     "answers",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("agent_id", sa.ForeignKey("agents.id"), nullable=False),
     sa.Column("request_id", sa.String(128), nullable=False),
     sa.Column("request_sha256", sa.LargeBinary(32), nullable=False),
@@ -108,14 +114,14 @@ submap_blobs = sa.Table(
     "submap_blobs",
     metadata,
     sa.Column("submap_id", sa.ForeignKey("submaps.id"), primary_key=True),
-    sa.Column("position", sa.Integer, primary_key=True),  # index in the header
+    sa.Column("position", INTEGER, primary_key=True),  # index in the header
     sa.Column("sha256", sa.String(64), nullable=False, index=True),
 )
 
 loops = sa.Table(
     "loops",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
     sa.Column("source", sa.String, nullable=False),  # resource names
     sa.Column("target", sa.String, nullable=False),
@@ -126,7 +132,7 @@ loops = sa.Table(
     sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
     sa.Column("fitness", sa.Float, nullable=False, default=0.0),
     sa.Column("rmse_m", sa.Float, nullable=False, default=0.0),
-    sa.Column("inliers", sa.Integer, nullable=False, default=0),
+    sa.Column("inliers", INTEGER, nullable=False, default=0),
     sa.Column("overlap", sa.Float, nullable=False, default=0.0),
     sa.Column("verify_seconds", sa.Float, nullable=False, default=0.0),
     sa.Column("kept", sa.Boolean, nullable=False, default=False),
@@ -137,7 +143,7 @@ snapshots = sa.Table(
     "snapshots",
     metadata,
     sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
-    sa.Column("revision", sa.Integer, nullable=False),  # with the changes since
+    sa.Column("revision", INTEGER, nullable=False),  # with the changes since
     sa.Column("snapshot", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
     # Whether a solve of the whole graph stands behind it and the changes since.
     sa.Column("settled", sa.Boolean, nullable=False, default=False),
@@ -148,14 +154,14 @@ snapshot_changes = sa.Table(
     "snapshot_changes",
     metadata,
     sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
-    sa.Column("revision", sa.Integer, primary_key=True),
+    sa.Column("revision", INTEGER, primary_key=True),
     sa.Column("change", sa.LargeBinary, nullable=False),  # magicslam.v1.PoseSnapshot
 )
 
 operations = sa.Table(
     "operations",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
     sa.Column("request_id", sa.String(128), nullable=False),
     sa.Column("request", sa.LargeBinary, nullable=False),  # magicslam.v1.BuildGlobalMapRequest
@@ -174,12 +180,12 @@ operations = sa.Table(
 maps = sa.Table(
     "maps",
     metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("id", INTEGER, primary_key=True),
     sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
     sa.Column("component", sa.String, nullable=False),
-    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("revision", INTEGER, nullable=False),
     sa.Column("submaps", sa.JSON, nullable=False),  # resource names
-    sa.Column("gaussian_count", sa.Integer, nullable=False),
+    sa.Column("gaussian_count", INTEGER, nullable=False),
     sa.Column("created_at", sa.Float, nullable=False),
 )
 
@@ -189,5 +195,23 @@ map_files = sa.Table(
     sa.Column("map_id", sa.ForeignKey("maps.id"), primary_key=True),
     sa.Column("format", sa.String(16), primary_key=True),  # ply, lossless, compact
     sa.Column("sha256", sa.String(64), nullable=False, index=True),
-    sa.Column("length", sa.Integer, nullable=False),
+    sa.Column("length", INTEGER, nullable=False),
+)
+
+# Which server works on a session when several share the database (leases.py).
+leases = sa.Table(
+    "leases",
+    metadata,
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), primary_key=True),
+    sa.Column("holder", sa.String(64), nullable=False),  # one run of one server
+    sa.Column("address", sa.String(255), nullable=False),  # where clients reach it
+    sa.Column("token", INTEGER, nullable=False),  # counts up with every change of the holder
+    sa.Column("expires_at", sa.Float, nullable=False),  # by the database's clock
+)
+
+# One row: which store this is, so that a blob folder is not used with another database.
+identity = sa.Table(
+    "identity",
+    metadata,
+    sa.Column("id", sa.String(32), primary_key=True),
 )

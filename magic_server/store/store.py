@@ -7,10 +7,10 @@ server that dies in between leaves blobs that nothing refers to, which the next 
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
 import os
 import time
+import uuid
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -18,20 +18,25 @@ from typing import Self
 
 import sqlalchemy as sa
 from magicslam.v1 import archive_pb2
+from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import WrongState
+from magic_server.store import ownership
 from magic_server.store.agents import AgentTable
 from magic_server.store.archive import ArchiveTable, ImportedSubmap
-from magic_server.store.blobs import BlobFolder, BlobWriter
+from magic_server.store.blobs import BlobFolder, BlobWriter, SharedBlobFolder
+from magic_server.store.commit_lock import CommitLock, SharedCommitLock
 from magic_server.store.database import Database
 from magic_server.store.deletions import Deletions
+from magic_server.store.engines import engine_of
+from magic_server.store.leases import LeaseTable
 from magic_server.store.loops import LoopTable
 from magic_server.store.maps import MapTable, NewMap
 from magic_server.store.rows import AgentRow, NewSubmap, SessionRow
-from magic_server.store.schema import map_files, submap_blobs
+from magic_server.store.schema import identity, map_files, submap_blobs
 from magic_server.store.submaps import FirstAnswer, SubmapTable
 from magic_server.store.uploads import UploadFolder
 from magic_server.store.usage import UsageTable
+from magic_server.store_config import StoreConfig
 from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
@@ -46,15 +51,24 @@ class Store:
         threads: Executor,
         *,
         partial_uploads: PartialUploadLimits | None = None,
+        config: StoreConfig | None = None,
+        replica: str = "",
     ) -> None:
+        """`replica` names this server among those that share a PostgreSQL database."""
+        engine = engine_of(config or StoreConfig(), folder)
         self.folder = folder
-        self.blobs = BlobFolder(folder)
-        self.uploads = UploadFolder(folder)
+        # What this server alone writes and reads.
+        self.scratch = folder / "replicas" / replica if engine.shared else folder
+        self.blobs = SharedBlobFolder(folder, self.scratch) if engine.shared else BlobFolder(folder)
+        self.uploads = UploadFolder(self.scratch)
         self._threads = threads
         self._partial_uploads = partial_uploads or PartialUploadLimits()
-        self._database = Database(folder / "magic.sqlite")
-        self._commit_lock = asyncio.Lock()
-        self._lock_file: int | None = None
+        self._database = Database(engine)
+        self._commit_lock = SharedCommitLock(self._database) if engine.shared else CommitLock()
+        self._lock_files: list[int] = []
+        # Which sessions this server works on; None where it has all of them.
+        self.leases = LeaseTable(self._database, replica) if engine.shared else None
+        self._database.fence = self.leases
         self.agents = AgentTable(self._database)
         self.submaps = SubmapTable(self._database, self.blobs)
         self.loops = LoopTable(self._database)
@@ -75,16 +89,31 @@ class Store:
     async def open(self) -> None:
         """Lock the folder, create what is missing and drop what a dead server left half done.
 
-        Raises WrongState when another server has the folder.
+        Raises WrongState when another server has the folder, ConfigError or Unavailable when the
+        database does not let this server in.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock_file = _locked(self.folder)
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        self._lock_files = [ownership.lock(self.folder, shared=self.leases is not None)]
+        if self.leases is None:
+            ownership.require_own_database(self.folder)
+        else:
+            self._lock_files.append(ownership.lock(self.scratch))
+        await self._database.open(first=self._require_database)
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._threads, self._open_folders)
-        await self._database.open()
         removed = await self.collect_orphans()
         if removed:
             logger.info("removed %d blobs that nothing referred to", removed)
+
+    async def _require_database(self, connection: AsyncConnection) -> None:
+        """Raise WrongState unless folder and database belong together; while nobody else can."""
+        if self.leases is None:
+            return
+        found = await connection.scalar(sa.select(identity.c.id))
+        new = found or uuid.uuid4().hex
+        ownership.require_database(self.folder, new, is_new=found is None)
+        if found is None:
+            await connection.execute(sa.insert(identity), {"id": new})
 
     def _open_folders(self) -> None:
         self.blobs.open()
@@ -93,9 +122,8 @@ class Store:
     async def close(self) -> None:
         """Close the database and give the folder free."""
         await self._database.close()
-        if self._lock_file is not None:
-            os.close(self._lock_file)
-            self._lock_file = None
+        while self._lock_files:
+            os.close(self._lock_files.pop())
 
     async def add_submap(
         self, agent: AgentRow, submap: NewSubmap, written: Sequence[BlobWriter], *, now: float
@@ -157,7 +185,7 @@ class Store:
     async def collect_orphans(self) -> int:
         """Remove blobs that no sub-map and no map refers to; returns how many."""
         loop = asyncio.get_running_loop()
-        async with self._commit_lock:
+        async with self._commit_lock.alone():
             async with self._database.read() as connection:
                 used = set(await connection.scalars(sa.select(submap_blobs.c.sha256).distinct()))
                 used |= set(await connection.scalars(sa.select(map_files.c.sha256).distinct()))
@@ -168,16 +196,3 @@ class Store:
                 return len(orphans)
 
             return await loop.run_in_executor(self._threads, remove)
-
-
-def _locked(folder: Path) -> int:
-    """An open file that holds the folder's lock for as long as this process lives."""
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise WrongState(
-            f"{folder} is in use by another server; stop it or choose another data folder"
-        ) from None
-    return descriptor

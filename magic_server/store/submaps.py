@@ -61,7 +61,7 @@ class SubmapTable:
 
         NotFound when its agent was deleted meanwhile.
         """
-        async with self._database.write() as connection:
+        async with self._database.write(agent.session.id) as connection:
             mine = sa.select(agents.c.id).where(agents.c.id == agent.id)
             if await connection.scalar(mine) is None:
                 name = names.agent_name(agent.session.name, agent.name)

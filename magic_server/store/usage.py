@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from magic_server.store.database import Database
+from magic_server.store.engines import total
 from magic_server.store.rows import AgentRow
 from magic_server.store.schema import agents, sessions, submaps
 
@@ -63,9 +64,7 @@ class UsageTable:
         return Population(found[0], found[1], found[2] == 0, found[3] == 0)
 
     async def _usage(self, condition: sa.ColumnElement[bool]) -> Usage:
-        total = sa.func.coalesce(sa.func.sum(submaps.c.stored_bytes), 0)
+        query = sa.select(sa.func.count(), total(submaps.c.stored_bytes)).where(condition)
         async with self._database.read() as connection:
-            row = (
-                await connection.execute(sa.select(sa.func.count(), total).where(condition))
-            ).one()
+            row = (await connection.execute(query)).one()
         return Usage(*row)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
+
 import grpc
 import pytest
 from grpc_status import rpc_status
 
 from magic_core import errors
-from magic_core.errors import FieldViolation, MagicError
+from magic_core.errors import FieldViolation, HeldElsewhere, MagicError
 from magic_core.wire import error_of, grpc_status_of, status_of
 
 
@@ -40,6 +42,15 @@ def test_every_error_comes_back_as_itself(kind: type[MagicError]) -> None:
     caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
     assert type(caught) is kind
     assert (caught.message, caught.violations) == (raised.message, violations)
+
+
+def test_the_server_to_ask_instead_crosses_the_wire_and_process_borders() -> None:
+    raised = HeldElsewhere("the session is elsewhere", holder="other:50051")
+    status = grpc_status_of(raised)
+    caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
+    for one in (caught, pickle.loads(pickle.dumps(raised))):
+        assert isinstance(one, HeldElsewhere)
+        assert (one.message, one.holder) == (raised.message, "other:50051")
 
 
 def test_how_long_to_wait_crosses_the_wire() -> None:

@@ -24,6 +24,8 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
+from magic_server.store_config import StoreConfig
+from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -36,9 +38,10 @@ def name_of(index: int, agent: int = 0) -> str:
     return f"{SESSION}/agents/agent_{agent}/submaps/{index}"
 
 
-def config_in(folder: Path) -> ServerConfig:
+def config_in(folder: Path, store: StoreConfig) -> ServerConfig:
     return ServerConfig(
         data_dir=folder,
+        store=store,
         listen=ListenConfig(port=0, stop_grace_s=2.0),
         jobs=JobConfig(workers=1, niceness=0),
         loops=LoopConfig(enabled=False),
@@ -46,10 +49,12 @@ def config_in(folder: Path) -> ServerConfig:
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def source(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[MagicClient]:
+async def source(
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore
+) -> AsyncIterator[MagicClient]:
     """A server whose session has two agents, a loop, a deleted sub-map and a merged map."""
     async with (
-        Server(config_in(tmp_path_factory.mktemp("source"))) as server,
+        Server(config_in(tmp_path_factory.mktemp("source"), new_store())) as server,
         MagicClient(server.address, ClientConfig(rpc_timeout_s=60.0)) as client,
     ):
         for agent, count in ((0, SUBMAPS), (1, 1)):
@@ -78,9 +83,11 @@ async def archive(source: MagicClient) -> bytes:
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def target(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Server]:
+async def target(
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore
+) -> AsyncIterator[Server]:
     """Another server, empty; tests that store something delete it again."""
-    async with Server(config_in(tmp_path_factory.mktemp("target"))) as server:
+    async with Server(config_in(tmp_path_factory.mktemp("target"), new_store())) as server:
         yield server
 
 
@@ -170,7 +177,7 @@ async def test_the_command_moves_a_session_between_a_server_and_a_folder(
     assert (await run(magic, "list", *folder))[0] == 1
     code, imported = await run(magic, "import", file, *folder)
     assert (code, imported["submap_count"]) == (0, shown["submap_count"])
-    async with Server(config_in(tmp_path / "store")) as server:
+    async with Server(config_in(tmp_path / "store", StoreConfig())) as server:
         assert (await run(magic, "list", *folder))[0] == 1  # in use by a server
         async with MagicClient(server.address) as client:
             await assert_same(source, client)

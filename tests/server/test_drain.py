@@ -136,9 +136,9 @@ async def test_health_answers_and_calls_are_refused_while_the_store_is_opened(
     loading = asyncio.Event()
     start_sessions = server.sessions.start
 
-    async def slowly() -> None:
+    async def slowly(**settings: bool) -> None:
         await loading.wait()
-        await start_sessions()
+        await start_sessions(**settings)
 
     monkeypatch.setattr(server.sessions, "start", slowly)
     starting = asyncio.create_task(server.start())

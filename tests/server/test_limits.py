@@ -35,6 +35,7 @@ from magic_server.loops import LoopConfig
 from magic_server.quotas import QuotaConfig, Rates
 from magic_server.resources import ResourceConfig, Resources, Room, available_memory
 from magic_server.server import Server
+from tests.postgresql import scratch_of
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 from tests.waiting import eventually
 
@@ -386,7 +387,7 @@ async def test_a_reserve_is_kept_for_the_database(
             await client.submit_submap(make_submap())
         with pytest.raises(DiskFull):
             await client.start_global_map("room")
-        assert not any((config.data_dir / "incoming").iterdir())
+        assert not any((scratch_of(config) / "incoming").iterdir())
 
 
 async def test_low_memory_refuses_and_recovers(tmp_path: Path) -> None:

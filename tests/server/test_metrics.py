@@ -29,6 +29,7 @@ from magic_server.config import ServerConfig
 from magic_server.native_log import handshake_reason
 from magic_server.probes import MAX_READERS, MetricsConfig
 from magic_server.server import Server
+from tests.postgresql import scratch_of
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
 
@@ -173,7 +174,7 @@ async def test_every_mutation_is_in_the_audit_log_with_who_and_what(
             await client.list_submaps("room")
             with pytest.raises(PermissionDenied):
                 await client.delete_session("room")
-    lines = (config.data_dir / "audit.jsonl").read_text().splitlines()
+    lines = (scratch_of(config) / "audit.jsonl").read_text().splitlines()
     entries = [json.loads(line) for line in lines]
     assert [entry["method"].rpartition("/")[2] for entry in entries] == [
         "RegisterAgent",

@@ -15,14 +15,17 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.preview_config import PreviewConfig
 from magic_server.server import Server
+from magic_server.store_config import StoreConfig
+from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 
 PREVIEW = "sessions/room/maps/preview"
 
 
-def config_of(folder, **preview) -> ServerConfig:
+def config_of(folder, store: StoreConfig, **preview) -> ServerConfig:
     return ServerConfig(
         data_dir=folder,
+        store=store,
         listen=ListenConfig(port=0, stop_grace_s=1.0),
         jobs=JobConfig(workers=1, niceness=0),
         preview=PreviewConfig(**preview),
@@ -42,9 +45,9 @@ def assert_same_places(found: GaussianCloud, expected: GaussianCloud) -> None:
         np.testing.assert_allclose(np.sort(cloud_axis), np.sort(expected_axis), atol=6e-4)
 
 
-async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path):
+async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path, new_store: NewStore):
     submaps = [make_submap(agent=0, index=i) for i in range(3)]
-    server_config = config_of(tmp_path, interval_s=0.1)
+    server_config = config_of(tmp_path, new_store(), interval_s=0.1)
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
         with pytest.raises(NotFound, match="nothing to show"):
@@ -115,8 +118,8 @@ async def placed(client: MagicClient, count: int):
     return info, await client.get_global_map(PREVIEW)
 
 
-async def test_without_following_it_is_made_when_asked_for(tmp_path):
-    server_config = config_of(tmp_path, enabled=False)
+async def test_without_following_it_is_made_when_asked_for(tmp_path, new_store: NewStore):
+    server_config = config_of(tmp_path, new_store(), enabled=False)
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
         submap = make_submap(agent=0, index=0)

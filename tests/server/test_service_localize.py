@@ -31,6 +31,7 @@ from magic_server.jobs import JobConfig
 from magic_server.localize_config import LocalizeConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
+from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, look, make_submap, path, render, thumbnail
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -41,10 +42,12 @@ SUBMAPS = 2
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def mapped(
     tmp_path_factory: pytest.TempPathFactory,
+    new_store: NewStore,
 ) -> AsyncIterator[tuple[Server, MagicClient]]:
     """A server started again on a map that one agent left, and an empty session beside it."""
     config = ServerConfig(
         data_dir=tmp_path_factory.mktemp("localize"),
+        store=new_store(),
         listen=ListenConfig(port=0, stop_grace_s=2.0),
         jobs=JobConfig(workers=1, niceness=0),
         loops=LoopConfig(enabled=False),

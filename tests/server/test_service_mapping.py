@@ -24,6 +24,7 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
+from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, make_submap, path
 from tests.waiting import eventually
 
@@ -43,9 +44,10 @@ def name_of(agent: int, index: int) -> str:
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory) -> ServerConfig:
+def config(tmp_path_factory: pytest.TempPathFactory, new_store: NewStore) -> ServerConfig:
     return ServerConfig(
         data_dir=tmp_path_factory.mktemp("mapping"),
+        store=new_store(),
         listen=ListenConfig(port=0, stop_grace_s=600.0),
         jobs=JobConfig(workers=2, niceness=0),
         loops=LoopConfig(top_k=2),

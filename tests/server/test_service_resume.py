@@ -20,6 +20,7 @@ from magic_core.wire import EncodedSubmap, chunks_of, encode_submap, error_of
 from magic_server.config import ServerConfig, ServiceLimits
 from magic_server.server import Server
 from magic_server.upload_config import PartialUploadLimits
+from tests.postgresql import scratch_of
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 from tests.waiting import eventually
 
@@ -72,7 +73,7 @@ async def send(server: Server, sent: Requests, *, hold: bool = False) -> str:
 
 def held_bytes(server: Server) -> int:
     """Bytes of blobs that lie in the folder of uploads."""
-    folder = server.config.data_dir / "uploads"
+    folder = server._store.scratch / "uploads"
     return sum(file.stat().st_size for file in folder.glob("*/[0-9]*"))
 
 
@@ -114,7 +115,7 @@ async def test_a_broken_stream_goes_on_behind_the_last_byte_that_came(
     assert await send(server, rest) == NAME
     found = await registered.download_encoded(NAME)
     assert (found.header, found.blobs) == (submap.header, submap.blobs)
-    assert list((server.config.data_dir / "uploads").iterdir()) == []
+    assert list((server._store.scratch / "uploads").iterdir()) == []
 
 
 async def test_a_server_that_was_killed_goes_on_with_what_had_come(
@@ -126,7 +127,7 @@ async def test_a_server_that_was_killed_goes_on_with_what_had_come(
         await register(client)
         sending = asyncio.create_task(send(first, sent, hold=True))
         await eventually(lambda: held_bytes(first) == payload(sent))
-        folder = server_config.data_dir / "uploads"
+        folder = scratch_of(server_config) / "uploads"
         # What a killed process leaves, before anything is tidied up.
         left = {file: file.read_bytes() for file in folder.glob("*/*")}
         sending.cancel()
@@ -149,7 +150,7 @@ async def test_bytes_that_the_disk_lost_are_sent_again(server_config: ServerConf
         await break_off(first, sent)
     # As after a loss of power: the newest chunk is zeros, and another one is cut off.
     last = sent[-1].chunk
-    blob = next((server_config.data_dir / "uploads").glob(f"*/{last.blob_index:05d}"))
+    blob = next((scratch_of(server_config) / "uploads").glob(f"*/{last.blob_index:05d}"))
     with blob.open("r+b") as file:
         file.seek(last.offset)
         file.write(bytes(len(last.data)))
@@ -209,7 +210,7 @@ async def test_a_refusal_after_resuming_leaves_nothing(
     rest[-1].chunk.data, rest[-1].chunk.crc32 = changed.data, changed.crc32
     with pytest.raises(MagicError, match="SHA-256"):
         await send(server, rest)
-    assert list((server.config.data_dir / "uploads").iterdir()) == []
+    assert list((server._store.scratch / "uploads").iterdir()) == []
     assert (await registered.resume_upload(NAME, "first")).durable_bytes == 0
 
 
@@ -246,7 +247,7 @@ async def test_uploads_that_broke_off_are_bounded_and_expire(server_config: Serv
         assert server_kept(server)[0] == 2
         assert (await client.resume_upload(NAME, "r0")).durable_bytes == 0
         assert (await client.resume_upload(NAME, "r2")).durable_bytes > 0
-    folder = config.data_dir / "uploads"
+    folder = scratch_of(config) / "uploads"
     assert len(list(folder.iterdir())) == 2
     yesterday = time.time() - 2 * kept.max_age_s
     for path in [*folder.glob("*/*"), *folder.iterdir()]:

@@ -123,7 +123,7 @@ async def test_concurrent_repeats_store_one_submap(registered: MagicClient, serv
     assert sum(not receipt.duplicate for receipt in receipts) == 1
     assert len({receipt.received_at for receipt in receipts}) == 1
     assert len(await registered.list_submaps("room")) == 1
-    assert list((server.config.data_dir / "incoming").iterdir()) == []
+    assert list((server._store.scratch / "incoming").iterdir()) == []
 
 
 async def test_a_request_id_brings_one_submap(registered: MagicClient, server: Server) -> None:
@@ -131,7 +131,7 @@ async def test_a_request_id_brings_one_submap(registered: MagicClient, server: S
     with pytest.raises(AlreadyExists, match=r"request .first. stored .*submaps/0"):
         await registered.submit_submap(make_submap(index=1), request_id="first")
     assert len(await registered.list_submaps("room")) == 1
-    assert list((server.config.data_dir / "uploads").iterdir()) == []
+    assert list((server._store.scratch / "uploads").iterdir()) == []
 
 
 async def test_another_request_for_a_stored_submap_is_refused(registered: MagicClient) -> None:
@@ -325,11 +325,11 @@ async def test_a_client_that_goes_away_leaves_nothing_but_what_it_can_go_on_with
     async with grpc.aio.insecure_channel(server.address) as channel:
         call = mapping_grpc.MappingServiceStub(channel).SubmitSubmap(stream())
         await half.wait()
-        await eventually(lambda: any((server.config.data_dir / "uploads").iterdir()))
+        await eventually(lambda: any((server._store.scratch / "uploads").iterdir()))
         call.cancel()
     await assert_nothing_is_left(server, registered)
     await registered.submit_encoded(encoded())
-    assert list((server.config.data_dir / "uploads").iterdir()) == []
+    assert list((server._store.scratch / "uploads").iterdir()) == []
 
 
 async def test_a_submap_beyond_the_servers_limit_is_refused(

@@ -66,7 +66,7 @@ async def test_one_trace_spans_agent_server_and_verification_job(
     assert submitted["attributes"]["submap"] == "sessions/room/agents/agent_1/submaps/0"
     assert received["attributes"]["agent"] == "agent_1"
     trace = chain[0]["trace_id"]
-    lines = (config.data_dir / "audit.jsonl").read_text().splitlines()
+    lines = (server._store.scratch / "audit.jsonl").read_text().splitlines()
     assert trace in {json.loads(line).get("trace_id") for line in lines}
     assert all(span["end_ns"] >= span["start_ns"] for span in found)
 
