@@ -60,16 +60,25 @@ class GlobalMaps:
         self._stopping = False
         self._closing = False
 
-    async def start(self) -> None:
-        """Go on with every operation that a stopped server left open."""
+    async def start(self, *, everything: bool = True) -> None:
+        """Go on with every operation that a stopped server left open.
+
+        Unless `everything` is taken up, that waits for `resume`.
+        """
         unfinished = await self._store.maps.unfinished()
         open_folders = {self._folder_of(operation.id) for operation in unfinished}
-        for leftover in self._store.folder.glob(f"{_MERGE_PREFIX}*"):
+        for leftover in self._store.scratch.glob(f"{_MERGE_PREFIX}*"):
             if leftover not in open_folders:
                 await self._in_thread(shutil.rmtree, leftover, True)
-        for operation in unfinished:
+        for operation in unfinished if everything else ():
             session = await self._store.agents.session(operation.session)
             self._begin(operation.id, session, operation.request)
+
+    async def resume(self, session: SessionRow) -> None:
+        """Go on with the operations of a session that this server has taken."""
+        for operation in await self._store.maps.unfinished():
+            if operation.session == session.name:
+                self._begin(operation.id, session, operation.request)
 
     def dismiss_waiters(self) -> None:
         """Answer those who wait for an operation now: the server is stopping."""
@@ -168,7 +177,7 @@ class GlobalMaps:
                 await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
 
     def _folder_of(self, operation: int) -> Path:
-        return self._store.folder / f"{_MERGE_PREFIX}{operation}"
+        return self._store.scratch / f"{_MERGE_PREFIX}{operation}"
 
     async def _task(
         self,

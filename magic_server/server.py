@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import logging
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -33,6 +34,7 @@ from magic_server.globalmaps import GlobalMaps
 from magic_server.health_port import HealthPort
 from magic_server.interceptors import CallInterceptor
 from magic_server.jobs import new_executor
+from magic_server.leasing import Leasing
 from magic_server.localizing import Localizer
 from magic_server.metrics import Metrics
 from magic_server.native_log import NativeLog
@@ -84,11 +86,24 @@ class Server:
             observer=self.metrics.job_done,
         )
         self._store = Store(
-            config.data_dir, self._threads, partial_uploads=config.limits.partial_uploads
+            config.data_dir,
+            self._threads,
+            partial_uploads=config.limits.partial_uploads,
+            config=config.store,
+            replica=config.cluster.name(config.listen.port),
         )
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
         self.sessions = Sessions(self._store, metrics=self.metrics, **shared)
         self._maps = GlobalMaps(self._store, self.sessions, **shared)
+        self._leasing: Leasing | None = None
+        if self._store.leases is not None:
+            self._leasing = Leasing(
+                self._store.leases,
+                store=self._store,
+                sessions=self.sessions,
+                maps=self._maps,
+                config=config.cluster,
+            )
         self._previews = Previews(
             self._store,
             self.sessions,
@@ -117,7 +132,7 @@ class Server:
         )
         self._audit = AuditLog(
             config.audit,
-            default=config.data_dir / "audit.jsonl",
+            default=self._store.scratch / "audit.jsonl",
             failures=self.metrics.audit_failures,
         )
         self._receiver = SubmapReceiver(
@@ -153,6 +168,13 @@ class Server:
         port = self._health_port
         return None if port is None else f"{self.config.health.host}:{port.port}"
 
+    def _public_address(self) -> str:
+        """Where other machines reach the server."""
+        host = self.config.listen.host
+        everywhere = host in ("0.0.0.0", "::", "[::]")
+        host = socket.getfqdn() if everywhere else host
+        return self.config.cluster.address or f"{host}:{self.port}"
+
     async def start(self) -> None:
         """Open the store, take up what was left, and serve."""
         try:
@@ -160,8 +182,10 @@ class Server:
             await self._listen()
             await self._store.open()
             await self._jobs.start()
-            await self.sessions.start()
-            await self._maps.start()
+            await self.sessions.start(everything=self._leasing is None)
+            await self._maps.start(everything=self._leasing is None)
+            if self._leasing is not None:
+                await self._leasing.start(self._public_address())
             self._upkeep.start()
             await self._previews.start()
             self.gate.open()
@@ -182,6 +206,8 @@ class Server:
     async def stop(self) -> None:
         """Refuse new calls, let those under way finish, keep everything that was acknowledged."""
         self.gate.drain()
+        if self._leasing is not None:
+            await self._leasing.stop_taking()
         if self._grpc is not None:
             # The port stays open for a while, so that callers read why they are refused.
             await self._set_ready(False)
@@ -197,6 +223,8 @@ class Server:
         await self._previews.close()
         await self.sessions.close()
         await self._jobs.close()
+        if self._leasing is not None:
+            await self._leasing.close()
         await self._store.close()
         await self._audit.close()
         if self._probes is not None:
@@ -214,6 +242,7 @@ class Server:
             resources=self._resources,
             metrics=self.metrics,
             audit=self._audit,
+            route=None if self._leasing is None else self._leasing.route,
         )
         server = grpc.aio.server(
             interceptors=[CallInterceptor(desk)], options=server_options(listen.transport)
