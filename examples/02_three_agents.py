@@ -42,16 +42,14 @@ async def main(out: Path) -> int:
         async with asyncio.TaskGroup() as group:
             for source in sources:
                 group.create_task(run(source))
-        for source in sources:
-            await client.get_trajectory("flat", source.name)  # waits until all of it is placed
-
+        # A merge waits for loops that are still being verified, and for the poses that follow.
+        info = await client.build_global_map("flat")
+        write_ply(out / "map.ply", await client.get_global_map(info.name))
+        print(f"{info.gaussian_count:,} Gaussians in {out / 'map.ply'}")
         snapshot = await client.get_corrected_poses("flat")
         for component in snapshot.components:
             agents = ", ".join(name.rpartition("/")[2] for name in component.agents)
             print(f"{component.submap_count} sub-maps in one frame: {agents}")
-        info = await client.build_global_map("flat")
-        write_ply(out / "map.ply", await client.get_global_map(info.name))
-        print(f"{info.gaussian_count:,} Gaussians in {out / 'map.ply'}")
         return len(snapshot.components)
 
 

@@ -34,7 +34,6 @@ class Replacement:
     because: str
 
 
-SMALL = "--merge.passes 2 --mapping.first-iterations 20"
 REPLACED = (
     Replacement(
         r"\bmake demo\b.*",

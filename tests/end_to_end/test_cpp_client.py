@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from magic_agent.client import MagicClient
+from magic_core.gaussians.ply import read_ply
 from magic_server.server import Server
 from tests.end_to_end.client_files import blobs_of, write_submap
 
@@ -73,6 +74,15 @@ async def test_cpp_submits_submaps_and_reads_loops_and_poses(
         translation = [values[axis] for axis in ("x", "y", "z")]
         expected_pose = mine.poses[pose["submap"]].world_from_anchor
         np.testing.assert_allclose(translation, expected_pose[:3, 3], atol=1e-12)
+
+    code, output, messages = await run(
+        program, server.address, "map", "room", f"{tmp_path}/map.ply"
+    )
+    assert code == 0, messages
+    assert len(read_ply(tmp_path / "map.ply")) == int(json.loads(output)["gaussian_count"]) > 1000
+    code, _, messages = await run(program, server.address, "map", "nowhere", f"{tmp_path}/no.ply")
+    assert code == 1
+    assert not (tmp_path / "no.ply").exists()
 
     code, _, messages = await run(program, server.address, "poses", "nowhere")
     assert code == 1

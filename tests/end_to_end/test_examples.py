@@ -45,7 +45,9 @@ def test_every_example_is_listed():
     listed = (EXAMPLES / "README.md").read_text()
     names = [path.name for path in sorted(EXAMPLES.glob("0*.py"))]
     assert len(names) == 5
-    assert all(name in listed for name in names)
+    clients = [f"clients/{path.name}" for path in sorted((EXAMPLES / "clients").iterdir())]
+    assert len(clients) == 2
+    assert all(name in listed for name in [*names, *clients])
 
 
 def test_a_single_agent_tracks_a_recording(recording, capsys):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from magic_agent.client import MagicClient
+from magic_core.gaussians.ply import read_ply
 from magic_server.server import Server
 from tests.end_to_end.client_files import blobs_of, spoil, write_submap
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, make_submap
@@ -67,7 +68,9 @@ async def test_node_submits_submaps(server: Server, client: MagicClient, tmp_pat
     assert len(await client.list_submaps("room")) == 1
 
 
-async def test_node_reads_corrected_poses_and_loops(server: Server, client: MagicClient) -> None:
+async def test_node_reads_poses_loops_and_the_map(
+    server: Server, client: MagicClient, tmp_path: Path
+) -> None:
     await install()
     for agent in range(2):
         await client.register_agent(
@@ -102,6 +105,13 @@ async def test_node_reads_corrected_poses_and_loops(server: Server, client: Magi
     assert loop["reason"] == recorded[0].reason
     assert {loop["source"], loop["target"]} == {name, name.replace("agent_1", "agent_0")}
     assert loop["similarity"] == pytest.approx(recorded[0].similarity)
+
+    code, answer = await ask(server, "map", "room", f"{tmp_path}/map.ply")
+    assert code == 0, answer
+    assert len(read_ply(tmp_path / "map.ply")) == int(answer["map"]["gaussian_count"]) > 1000
+    code, answer = await ask(server, "map", "nowhere", f"{tmp_path}/no.ply")
+    assert (code, answer["error"]["code"]) == (1, "NOT_FOUND")
+    assert not (tmp_path / "no.ply").exists()
 
     code, answer = await ask(server, "poses", "nowhere")
     assert code == 1

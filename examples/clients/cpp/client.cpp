@@ -1,14 +1,16 @@
-// Submits sub-maps to a magic-slam server and reads loops and corrected poses, printed as JSON.
+// Submits sub-maps to a magic-slam server and reads loops, corrected poses and the map, printed as JSON.
 //
 //   client ADDRESS submit HEADER.json BLOB...    the header as proto3 JSON, its blobs' files in order
 //   client ADDRESS loops SUBMAP                  SUBMAP: sessions/{s}/agents/{a}/submaps/{m}
 //   client ADDRESS poses SESSION [AGENT]
+//   client ADDRESS map SESSION FILE.ply          the newest merged map, or the preview before there is one
 //
 // `submit` fills in each blob's length and SHA-256. Sent again, the same sub-map gets its first answer.
 
 #include <algorithm>
 #include <chrono>
 #include <cstdint>
+#include <cstdio>
 #include <fstream>
 #include <iostream>
 #include <iterator>
@@ -19,9 +21,11 @@
 
 #include <google/protobuf/util/json_util.h>
 #include <grpcpp/grpcpp.h>
+#include <openssl/evp.h>
 #include <openssl/sha.h>
 #include <zlib.h>
 
+#include "magicslam/v1/global_map_service.grpc.pb.h"
 #include "magicslam/v1/mapping_service.grpc.pb.h"
 
 namespace api = magicslam::v1;
@@ -32,6 +36,10 @@ namespace {
 constexpr std::size_t kChunkBytes = 1 << 20;
 constexpr std::chrono::seconds kDeadline{20};
 constexpr std::chrono::seconds kUploadDeadline{300};
+constexpr std::chrono::seconds kDownloadDeadline{600};
+
+using Channel = std::shared_ptr<grpc::Channel>;
+using Arguments = std::vector<std::string>;
 
 // A call that the server refused, or that never reached it.
 struct Refused : std::runtime_error {
@@ -121,16 +129,17 @@ bool WriteBlob(grpc::ClientWriter<api::SubmitSubmapRequest>& writer, std::uint32
   return true;
 }
 
-std::string Submit(api::MappingService::Stub& stub, const std::vector<std::string>& arguments) {
+std::string Submit(const Channel& channel, const Arguments& arguments) {
+  const auto stub = api::MappingService::NewStub(channel);
   std::vector<std::string> blobs;
   for (std::size_t i = 1; i < arguments.size(); ++i) blobs.push_back(ReadFile(arguments[i]));
   const api::SubmapHeader header = ReadHeader(arguments.at(0), blobs);
-  Register(stub, header);
+  Register(*stub, header);
 
   grpc::ClientContext context;
   SetDeadline(context, kUploadDeadline);
   api::SubmitSubmapResponse answer;
-  auto writer = stub.SubmitSubmap(&context, &answer);
+  auto writer = stub->SubmitSubmap(&context, &answer);
   api::SubmitSubmapRequest first;
   *first.mutable_header() = header;
   bool open = writer->Write(first);
@@ -140,42 +149,79 @@ std::string Submit(api::MappingService::Stub& stub, const std::vector<std::strin
   return Json(answer);
 }
 
-std::string Loops(api::MappingService::Stub& stub, const std::vector<std::string>& arguments) {
+std::string Loops(const Channel& channel, const Arguments& arguments) {
   api::QueryLoopsRequest request;
   request.set_submap(arguments.at(0));
   api::QueryLoopsResponse answer;
   grpc::ClientContext context;
   SetDeadline(context, kDeadline);
-  Require(stub.QueryLoops(&context, request, &answer));
+  Require(api::MappingService::NewStub(channel)->QueryLoops(&context, request, &answer));
   return Json(answer);
 }
 
-std::string Poses(api::MappingService::Stub& stub, const std::vector<std::string>& arguments) {
+std::string Poses(const Channel& channel, const Arguments& arguments) {
   api::GetCorrectedPosesRequest request;
   request.set_session("sessions/" + arguments.at(0));
   if (arguments.size() > 1) request.set_agent(request.session() + "/agents/" + arguments[1]);
   api::GetCorrectedPosesResponse answer;
   grpc::ClientContext context;
   SetDeadline(context, kDeadline);
-  Require(stub.GetCorrectedPoses(&context, request, &answer));
+  Require(api::MappingService::NewStub(channel)->GetCorrectedPoses(&context, request, &answer));
   return Json(answer.snapshot());
 }
 
-int Run(const std::vector<std::string>& arguments) {
+// Writes the map's file as it comes. Nothing is left of a broken one.
+std::string Map(const Channel& channel, const Arguments& arguments) {
+  const std::string& path = arguments.at(1);
+  api::GetGlobalMapRequest request;
+  request.set_name("sessions/" + arguments[0]);
+  request.set_format(api::MAP_FORMAT_PLY);
+  const auto stub = api::GlobalMapService::NewStub(channel);
+  grpc::ClientContext context;
+  SetDeadline(context, kDownloadDeadline);
+  auto reader = stub->GetGlobalMap(&context, request);
+  api::GlobalMapHeader header;
+  const std::unique_ptr<EVP_MD_CTX, decltype(&EVP_MD_CTX_free)> digest(EVP_MD_CTX_new(), EVP_MD_CTX_free);
+  EVP_DigestInit_ex(digest.get(), EVP_sha256(), nullptr);
+  std::ofstream file(path, std::ios::binary);
+  bool whole = true;
+  for (api::GetGlobalMapResponse message; whole && reader->Read(&message);) {
+    if (message.has_header()) {
+      header = message.header();
+      continue;
+    }
+    const std::string& data = message.chunk().data();
+    whole = Crc32(data) == message.chunk().crc32();
+    EVP_DigestUpdate(digest.get(), data.data(), data.size());
+    file.write(data.data(), static_cast<std::streamsize>(data.size()));
+  }
+  if (!whole) context.TryCancel();
+  const grpc::Status status = reader->Finish();
+  std::string found(SHA256_DIGEST_LENGTH, '\0');
+  EVP_DigestFinal_ex(digest.get(), reinterpret_cast<unsigned char*>(found.data()), nullptr);
+  file.close();
+  if (whole && status.ok() && file && found == header.sha256()) return Json(header.map());
+  std::remove(path.c_str());
+  if (whole) Require(status);
+  throw std::runtime_error(path + ": the map came damaged, or could not be written");
+}
+
+int Run(const Arguments& arguments) {
   const std::string command = arguments.size() > 2 ? arguments[1] : "";
   const auto action = command == "submit"  ? Submit
                       : command == "loops" ? Loops
                       : command == "poses" ? Poses
+                      : command == "map"   ? Map
                                            : nullptr;
-  if (action == nullptr) {
+  const std::size_t least = command == "map" || command == "submit" ? 4 : 3;
+  if (action == nullptr || arguments.size() < least) {
     std::cerr << "usage: client ADDRESS submit HEADER.json BLOB... | loops SUBMAP | "
-                 "poses SESSION [AGENT]\n";
+                 "poses SESSION [AGENT] | map SESSION FILE\n";
     return 2;
   }
   const auto channel = grpc::CreateChannel(arguments[0], grpc::InsecureChannelCredentials());
-  const auto stub = api::MappingService::NewStub(channel);
   try {
-    std::cout << action(*stub, {arguments.begin() + 2, arguments.end()}) << "\n";
+    std::cout << action(channel, {arguments.begin() + 2, arguments.end()}) << "\n";
     return 0;
   } catch (const Refused& refused) {
     std::cerr << "refused with code " << refused.code << ": " << refused.what() << "\n";

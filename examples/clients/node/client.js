@@ -1,14 +1,15 @@
-// Submits sub-maps to a magic-slam server and reads loops and corrected poses, printed as JSON.
+// Submits sub-maps to a magic-slam server and reads loops, corrected poses and the map, printed as JSON.
 //
 //   node client.js ADDRESS submit HEADER.json BLOB...    the header as proto3 JSON, its blobs' files in order
 //   node client.js ADDRESS poses SESSION [AGENT]     for example: node client.js localhost:50051 poses kitchen
 //   node client.js ADDRESS loops SUBMAP              SUBMAP: sessions/{s}/agents/{a}/submaps/{m}
+//   node client.js ADDRESS map SESSION FILE.ply      the newest merged map, or the preview before there is one
 //
 // It loads the .proto files at run time; nothing is generated. `submit` fills in each blob's length and
 // SHA-256. Sent again, the same sub-map gets its first answer.
 
 import { createHash } from "node:crypto";
-import { readFile } from "node:fs/promises";
+import { open, readFile, rm } from "node:fs/promises";
 import path from "node:path";
 import process from "node:process";
 import { fileURLToPath } from "node:url";
@@ -19,18 +20,22 @@ import protoLoader from "@grpc/proto-loader";
 const PROTO_ROOT = path.resolve(path.dirname(fileURLToPath(import.meta.url)), "../../../proto");
 const DEADLINE_MS = 20_000;
 const UPLOAD_DEADLINE_MS = 300_000;
+const DOWNLOAD_DEADLINE_MS = 600_000;
 const CHUNK_BYTES = 1 << 20;
 
 // Names stay as the .proto writes them; 64-bit numbers become strings, enums their names, and every
 // field is there even where it was not sent (absent messages as null).
-const definition = protoLoader.loadSync("magicslam/v1/mapping_service.proto", {
-  includeDirs: [PROTO_ROOT],
-  keepCase: true,
-  longs: String,
-  enums: String,
-  defaults: true,
-});
-const { MappingService } = grpc.loadPackageDefinition(definition).magicslam.v1;
+const definition = protoLoader.loadSync(
+  ["magicslam/v1/mapping_service.proto", "magicslam/v1/global_map_service.proto"],
+  {
+    includeDirs: [PROTO_ROOT],
+    keepCase: true,
+    longs: String,
+    enums: String,
+    defaults: true,
+  },
+);
+const { MappingService, GlobalMapService } = grpc.loadPackageDefinition(definition).magicslam.v1;
 
 /** Calls a unary method with a deadline; resolves to the answer. */
 function call(client, method, request) {
@@ -125,11 +130,48 @@ async function loops(client, submap) {
   return call(client, "QueryLoops", { submap });
 }
 
-const COMMANDS = { submit, poses, loops };
+/** Writes the map's file as it comes; resolves to what the server says of it. Nothing is left of a broken one. */
+async function map(client, session, path) {
+  const maps = new GlobalMapService(client.getChannel().getTarget(), grpc.credentials.createInsecure());
+  const request = { name: `sessions/${session}`, format: "MAP_FORMAT_PLY" };
+  const stream = maps.GetGlobalMap(request, { deadline: Date.now() + DOWNLOAD_DEADLINE_MS });
+  const file = await open(path, "w");
+  const digest = createHash("sha256");
+  let header = null;
+  let written = 0;
+  try {
+    for await (const message of stream) {
+      if (message.payload === "header") {
+        header = message.header;
+        continue;
+      }
+      const { data, crc32: expected } = message.chunk;
+      if (crc32(data) !== expected) throw new Error(`the chunk at byte ${written} is damaged`);
+      await file.write(data);
+      digest.update(data);
+      written += data.length;
+    }
+    if (header === null || !digest.digest().equals(header.sha256)) {
+      throw new Error(`the map is damaged: ${written} of ${header?.length ?? 0} bytes came, or others`);
+    }
+  } catch (error) {
+    await rm(path);
+    throw error;
+  } finally {
+    await file.close();
+    maps.close();
+  }
+  return { map: header.map, bytes: written, file: path };
+}
+
+const COMMANDS = { submit, poses, loops, map };
+const LEAST = { submit: 2, poses: 1, loops: 1, map: 2 };
 
 async function main([address, command, ...rest]) {
-  if (!address || !(command in COMMANDS) || rest.length === 0) {
-    process.stderr.write("usage: node client.js ADDRESS submit HEADER.json BLOB... | loops SUBMAP | poses SESSION [AGENT]\n");
+  if (!address || !(command in COMMANDS) || rest.length < LEAST[command]) {
+    process.stderr.write(
+      "usage: node client.js ADDRESS submit HEADER.json BLOB... | loops SUBMAP | poses SESSION [AGENT] | map SESSION FILE\n",
+    );
     return 2;
   }
   const client = new MappingService(address, grpc.credentials.createInsecure());
