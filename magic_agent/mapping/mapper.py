@@ -281,7 +281,7 @@ class Mapper:
 
     def _seed(self, frame: Frame, anchor_from_camera: Pose, view: RenderedView | None) -> int:
         optimiser = self._active()
-        room = self._config.max_gaussians - len(optimiser)
+        room = self._config.gaussian_bound(self._camera) - len(optimiser)
         if room <= 0:
             return 0
         seeds = self._seeder.seeds(

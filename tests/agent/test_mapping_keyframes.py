@@ -99,7 +99,7 @@ def test_fast_schedule_keeps_what_the_user_set():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("iterations", 0), ("newest_share", 1.5), ("seed_opacity", 1.0), ("max_gaussians", 0)],
+    [("iterations", 0), ("newest_share", 1.5), ("seed_opacity", 1.0), ("max_gaussians", -1)],
 )
 def test_values_out_of_range_are_named(name, value):
     with pytest.raises(ConfigError, match=f"mapping.{name}"):

@@ -76,6 +76,12 @@ def test_size_of_a_sub_map_is_bounded():
     assert 0 < len(mapper) <= 700
 
 
+def test_the_bound_follows_the_size_of_the_image_unless_it_is_given():
+    bound, given = CONFIG.gaussian_bound, replace(CONFIG, max_gaussians=700).gaussian_bound
+    assert bound(CAMERA.scaled(2.0)) == 4 * bound(CAMERA) > 0
+    assert given(CAMERA.scaled(2.0)) == given(CAMERA) == 700
+
+
 def test_images_kept_are_bounded_and_the_best_covered_makes_room():
     mapper = begun(replace(CONFIG, iterations=2, anchor_iterations=2, max_keyframes=3))
     elsewhere = se3.exp([0, 0, 0, 0, 1.2, 0])
