@@ -26,7 +26,7 @@ class SubmapEncoding:
     """`lossless` keeps every float32 bit; `compact` is about a quarter of the size."""
     colour: Literal["jpeg", "png"] = "jpeg"
     """`png` is lossless."""
-    jpeg_quality: int = 95
+    jpeg_quality: int = 90
     """1 to 100."""
     metres_per_unit: float = 0.001
     """Step of the 16-bit depth images, metres; the largest depth is 65,535 steps."""
