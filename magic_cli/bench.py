@@ -9,6 +9,7 @@ magic bench merge RUN|DATASET              fine merging against the paper's sche
 magic bench codec DATASET|RUN              bytes per sub-map, and what the compact codec costs
 magic bench ablations DATASET              the paper's tables with our rows, each part left out
 magic bench server                         many agents at once: rate, latencies, memory, event loop
+magic bench viewer                         what watching a large map costs: processor time and bytes
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ BENCHMARKS = {
     "codec": "magic_cli.benchmarks.codec",
     "ablations": "magic_cli.benchmarks.ablations",
     "server": "magic_cli.benchmarks.server",
+    "viewer": "magic_cli.benchmarks.viewer",
 }
 
 

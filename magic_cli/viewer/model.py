@@ -105,6 +105,16 @@ class SessionView:
             if view.agent == agent and view.name in anchors
         ]
 
+    def camera_positions(self, component: str) -> NDArray[np.float64]:
+        """(k, 3) where the cameras of a component's frames stood, in its own world frame."""
+        assert self.snapshot is not None
+        parts = [
+            (pose.world_from_anchor @ self.submaps[name].path)[:, :3, 3]
+            for name, pose in self.snapshot.poses.items()
+            if pose.component == component and name in self.submaps
+        ]
+        return np.concatenate(parts) if parts else np.zeros((0, 3))
+
     def agent_names(self) -> tuple[str, ...]:
         """Agents that have sent something, sorted."""
         return tuple(sorted({view.agent for view in self.submaps.values()}))

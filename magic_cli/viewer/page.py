@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magic_cli.viewer.model import Pose, SessionView
 from magic_cli.viewer.panel import Panel
 from magic_cli.viewer.scene import Scene
+from magic_cli.viewer.vantage import outside
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import se3
 
@@ -23,12 +24,21 @@ class Page:
 
     def __init__(self, *, host: str, port: int, max_splats: int) -> None:
         with contextlib.redirect_stdout(io.StringIO()):  # its banner; ours comes from the command
-            self._server = viser.ViserServer(host=host, port=port, label="magic-slam")
+            self._server = viser.ViserServer(
+                host=host, port=port, label="magic-slam", verbose=False
+            )
         self._lock = threading.Lock()
         self._render_lock = threading.Lock()
         self._view: SessionView | None = None
         self._rasteriser: Any = None
-        self._panel = Panel(self._server, render=self._rendered, export_map=self._whole_map)
+        self._placed_for = 0
+        """How many sub-maps there were when newcomers' view was chosen."""
+        self._panel = Panel(
+            self._server,
+            render=self._rendered,
+            export_map=self._whole_map,
+            see_everything=self._see_everything,
+        )
         self._scene = Scene(
             self._server,
             max_splats=max_splats,
@@ -45,17 +55,40 @@ class Page:
     def update(self, view: SessionView) -> None:
         """Show the newest state."""
         with self._lock:
-            first = self._view is None or not self._view.submaps
             self._view = view
-            if first:
-                self._scene.look_from_outside(view)
             self._scene.update(view)
             self._panel.update(view)
+            if len(view.submaps) != self._placed_for:
+                self._place_cameras(view, everyone=self._placed_for == 0)
+                self._placed_for = len(view.submaps)
             self._follow(view)
 
     def close(self) -> None:
         """Stop serving the page."""
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def _place_cameras(self, view: SessionView, *, everyone: bool) -> None:
+        """New visitors see the whole map; so does everyone who waited for its first part."""
+        anchors = view.world_from_anchor()
+        if not anchors:
+            return
+        position, look_at, _ = outside(view, anchors)
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = tuple(position), tuple(look_at)
+        if everyone:
+            for client in self._server.get_clients().values():
+                client.camera.position, client.camera.look_at = tuple(position), tuple(look_at)
+
+    def _see_everything(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            anchors = self._view.world_from_anchor() if self._view else {}
+            if self._view is None or not anchors:
+                return
+            position, look_at, up = outside(self._view, anchors)
+        with client.atomic():
+            client.camera.up_direction = tuple(up)
+            client.camera.position, client.camera.look_at = tuple(position), tuple(look_at)
 
     def _follow(self, view: SessionView) -> None:
         """Put every visitor's camera behind the followed agent's newest frame."""

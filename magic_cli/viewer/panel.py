@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,15 +13,21 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from magic_cli.loops import EXPLANATIONS, NO_CANDIDATES
+from magic_cli.loops import NO_CANDIDATES
 from magic_cli.viewer.colours import loop_colour
 from magic_cli.viewer.model import SessionView
 from magic_cli.viewer.scene import HIDDEN_AT_FIRST, LAYERS, Scene
+from magic_cli.viewer.words import (
+    agents_text,
+    keyframe_text,
+    loop_text,
+    loop_title,
+    short,
+    summary_text,
+)
 from magic_core.evaluation.trajectory import Trajectory, write_tum
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.ply import write_ply
-from magic_core.submap import Keyframe
-from magic_core.wire import names
 from magic_core.wire.records import LoopCandidate
 
 _NONE = "none"
@@ -40,7 +45,9 @@ class Panel:
         *,
         render: Callable[[str, int], NDArray[np.uint8]],
         export_map: Callable[[], GaussianCloud],
+        see_everything: Callable[[viser.ClientHandle], None],
     ) -> None:
+        self._see_everything = see_everything
         self._server = server
         self._render = render
         self._export_map = export_map
@@ -54,7 +61,7 @@ class Panel:
     def build(self, scene: Scene) -> None:
         """Make all controls; called once, when the scene exists."""
         gui = self._server.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, control_width="medium")
+        gui.configure_theme(dark_mode=True, show_logo=False, control_width="large")
         self._summary = gui.add_markdown("Waiting for the first sub-map.")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map"):
@@ -63,6 +70,9 @@ class Panel:
                 box.on_update(
                     lambda event, layer=layer: scene.show_layer(layer, event.target.value)
                 )
+            gui.add_button("see everything").on_click(
+                lambda event: event.client and self._see_everything(event.client)
+            )
             self._follow: Any = gui.add_dropdown("follow", (_ALL,))
             self._follow.on_update(self._on_follow)
         with tabs.add_tab("Agents"):
@@ -71,6 +81,7 @@ class Panel:
         with tabs.add_tab("Loops"):
             self._loop: Any = gui.add_dropdown("candidate", (_NONE,))
             self._loop.on_update(lambda event: self.choose_loop(event.target.value))
+            gui.add_button("look at it").on_click(self._look_at_loop)
             self._loop_text = gui.add_markdown(_CHOOSE_LOOP)
             self._loop_images = [gui.add_image(_IMAGE, label=t) for t in ("source", "target")]
         with tabs.add_tab("Keyframe"):
@@ -123,6 +134,20 @@ class Panel:
         """As if it had been chosen in the list; said beside the map too, whatever tab is open."""
         self._loop.value = loop_title(loop)
         self._say(f"Loop {loop_title(loop)}", loop_text(loop, plain=True), loop_colour(loop))
+
+    def _look_at_loop(self, event: Any) -> None:
+        """Move a visitor's camera so that both ends of the chosen loop are in the picture."""
+        loop, view = self._loops.get(self._loop.value), self._view
+        anchors = view.world_from_anchor() if view else {}
+        if loop is None or not {loop.source, loop.target} <= anchors.keys():
+            return
+        ends = np.stack([anchors[name][:3, 3] for name in (loop.source, loop.target)])
+        middle, camera = ends.mean(axis=0), event.client.camera
+        away = np.asarray(camera.position) - np.asarray(camera.look_at)
+        away = away / max(float(np.linalg.norm(away)), 1e-6)
+        distance = max(_NEAREST_M, 1.5 * float(np.linalg.norm(ends[1] - ends[0])))
+        with event.client.atomic():
+            camera.position, camera.look_at = tuple(middle + distance * away), tuple(middle)
 
     def select_keyframe(self, name: str, number: int) -> None:
         """As if it had been chosen in the lists."""
@@ -178,90 +203,8 @@ class Panel:
 
 _SHOWN = ("ACCEPTED", "REJECTED")
 _CHOOSE_LOOP = "Choose a candidate, or click a mark in the map."
+_NEAREST_M = 2.5
 _BLUE = (79, 156, 255)
-
-
-def summary_text(view: SessionView, shown: int) -> str:
-    """One paragraph: revision, counts, and how much of the map the browser has."""
-    snapshot = view.snapshot
-    if snapshot is None or not view.submaps:
-        return f"**{view.session}**: waiting for the first sub-map."
-    what = "merged map" if view.merged else "sub-maps"
-    verdicts = [loop.verdict for loop in view.loops]
-    lines = [
-        f"**{view.session}**, pose graph revision {snapshot.revision}",
-        f"{len(view.submaps)} sub-maps in {len(snapshot.components)} component(s)",
-        f"showing the {what}, {shown:,} Gaussians",
-        f"loops: {verdicts.count('ACCEPTED')} accepted ({snapshot.loops_kept} relied on), "
-        f"{verdicts.count('REJECTED')} rejected, {verdicts.count('PENDING')} under verification",
-    ]
-    return "  \n".join(lines)
-
-
-def agents_text(view: SessionView, *, now: datetime | None = None) -> str:
-    """A table: state, when last heard of, what it sent, and whom it shares a map with."""
-    if not view.agents:
-        return "No agent yet."
-    now = now or datetime.now(UTC)
-    rows = [
-        f"| {names.parse_agent(agent.name)[1]} | {agent.state.lower()} | "
-        f"{max(0, round((now - agent.last_seen_at).total_seconds()))} s ago | "
-        f"{agent.submap_count} | {_frames(view, agent.name)} | {_map_of(view, agent.name)} |"
-        for agent in view.agents
-    ]
-    head = ["| agent | state | heard of | sub-maps | frames | map |", "|---|---|---|---|---|---|"]
-    return "\n".join([*head, *rows])
-
-
-def _frames(view: SessionView, agent: str) -> int:
-    """Frames in the sub-maps that an agent sent."""
-    return sum(len(s.path) for n, s in view.submaps.items() if n.startswith(f"{agent}/"))
-
-
-def _map_of(view: SessionView, agent: str) -> str:
-    """Whether an agent's sub-maps lie in one map with those of others."""
-    if view.snapshot is None or _frames(view, agent) == 0:
-        return ""
-    joined = any(agent in c.agents and len(c.agents) > 1 for c in view.snapshot.components)
-    return "joined" if joined else "alone"
-
-
-def loop_title(loop: LoopCandidate) -> str:
-    """`agent_0/1 - agent_2/3: REJECTED, FREE_SPACE`."""
-    end = "" if loop.verdict == "ACCEPTED" else f", {loop.reason}"
-    return f"{short(loop.source)} - {short(loop.target)}: {loop.verdict}{end}"
-
-
-def loop_text(loop: LoopCandidate, *, plain: bool = False) -> str:
-    """A candidate's verdict and figures, as Markdown or plain text."""
-    used = " and relied on" if loop.kept else ""
-    set_aside = loop.verdict == "ACCEPTED" and not loop.kept
-    reason = "SET_ASIDE_BY_SOLVER" if set_aside else loop.reason
-    lines = [
-        f"similarity {loop.similarity:.2f}, overlap {loop.overlap:.2f}",
-        f"fitness {loop.fitness:.2f}, RMSE {1e3 * loop.rmse_m:.1f} mm, {loop.inliers} inliers",
-        f"verified in {loop.verify_seconds:.2f} s",
-    ]
-    if plain:
-        return ", ".join(lines)
-    head = [f"**{loop.verdict}{used}**: `{reason}`", EXPLANATIONS.get(reason, "")]
-    return "  \n".join([line for line in (*head, *lines) if line])
-
-
-def keyframe_text(agent: str, keyframe: Keyframe, rendered: NDArray[np.uint8]) -> str:
-    """Which frame it is, and how well the map shows it."""
-    error = np.square(keyframe.colour.astype(np.float64) - rendered).mean()
-    psnr_db = 10.0 * np.log10(255.0**2 / max(float(error), 1e-6))
-    return (
-        f"Frame {keyframe.frame_index} of {agent}, {keyframe.timestamp_s:.2f} s  \n"
-        f"rendered against real: PSNR {psnr_db:.1f} dB"
-    )
-
-
-def short(name: str) -> str:
-    """`agent/3` of a sub-map's resource name."""
-    _, agent, index = names.parse_submap(name)
-    return f"{agent}/{index}"
 
 
 def trajectories_zip(view: SessionView) -> bytes:

@@ -17,18 +17,19 @@ from magic_cli.viewer.colours import colour_of
 from magic_cli.viewer.detail import covariances, keep_every, thinned
 from magic_cli.viewer.lines import LineLayer, Lines
 from magic_cli.viewer.model import Pose, SessionView, SubmapView
+from magic_cli.viewer.vantage import Vector, above, up_of
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
 from magic_core.wire.records import LoopCandidate
 
-Layer = Literal["splats", "anchors", "keyframes"] | LineLayer
+Layer = Literal["splats", "ceiling", "anchors", "keyframes"] | LineLayer
 LAYERS: tuple[Layer, ...] = (
-    "splats", "paths", "tracked paths", "anchors", "keyframes", "accepted loops", "rejected loops",
+    "splats", "ceiling", "paths", "tracked paths", "anchors", "keyframes", "accepted loops",
+    "rejected loops",
 )  # fmt: skip
-HIDDEN_AT_FIRST: frozenset[Layer] = frozenset({"tracked paths", "keyframes"})
+HIDDEN_AT_FIRST: frozenset[Layer] = frozenset({"ceiling", "tracked paths", "keyframes"})
 
 _THUMBNAIL_STEP = 4
-_EVERY_MEAN = 16
 _ANCHOR_M = 0.12
 _KEYFRAME_M = 0.07
 _PYRAMID_FACES = np.array(
@@ -59,9 +60,10 @@ class Scene:
         self._keyframes: dict[str, Any] = {}
         self._merged: dict[str, Any] = {}
         self._keep_every = 1
+        self._with_ceiling = False
+        self._up: Vector | None = None
         self._replaced: frozenset[str] = frozenset()
         """Sub-maps whose component is shown as a merged map."""
-        server.scene.set_up_direction("-y")  # the world is the first camera's frame: y is down
         server.scene.set_background_image(np.full((2, 2, 3), (22, 26, 34), np.uint8))
 
     @property
@@ -91,8 +93,11 @@ class Scene:
     def update(self, view: SessionView) -> None:
         """Bring the picture to the newest state: adds what is new, moves what is there."""
         anchors = view.world_from_anchor()
+        if self._up is None and anchors:
+            self._up = up_of(view, anchors)
+            self._server.scene.set_up_direction(tuple(self._up))
         with self._server.atomic():
-            self._thin(view)
+            self._send_again(view, anchors)
             for name, pose in anchors.items():
                 self._place(view.submaps[name], pose)
             for name in self._splats.keys() - anchors.keys():
@@ -103,50 +108,51 @@ class Scene:
             self._lines.update(view, anchors)
         self._refresh_visibility()
 
-    def look_from_outside(self, view: SessionView) -> None:
-        """Point the cameras of new visitors at the whole map, from behind and above the agents."""
-        anchors = view.world_from_anchor()
-        if not anchors:
-            return
-        means = np.concatenate(
-            [
-                se3.transform_points(pose, view.submaps[name].cloud.means[::_EVERY_MEAN])
-                for name, pose in anchors.items()
-            ]
-        )
-        centre = np.median(means, axis=0)
-        reach = max(1.0, float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.9)))
-        ahead = np.stack([pose[:3, 2] for pose in anchors.values()]).mean(axis=0)
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-6)
-        right = np.cross([0.0, 1.0, 0.0], ahead)
-        # The panel covers the right of the page, so the map is put to the left of its middle.
-        target = centre + 0.45 * reach * right
-        camera = self._server.initial_camera
-        camera.position = tuple(target - 1.9 * reach * ahead + [0.0, -1.1 * reach, 0.0])
-        camera.look_at = tuple(target)
-
-    def _thin(self, view: SessionView) -> None:
-        """Send all splats again, thinner, when the limit is passed (each time half as many)."""
+    def _send_again(self, view: SessionView, anchors: dict[str, Pose]) -> None:
+        """Send all splats again when the limit is passed (each time half as many are left), or
+        when the ceiling was switched on or off."""
         step = keep_every(sum(len(s.cloud) for s in view.submaps.values()), self._max_splats)
-        if step == self._keep_every:
+        ceiling = self._layers["ceiling"]
+        if (step, ceiling) == (self._keep_every, self._with_ceiling):
             return
-        self._keep_every = step
+        if ceiling != self._with_ceiling:
+            for _, handle in self._merged.values():
+                handle.remove()
+            self._merged.clear()
+        self._keep_every, self._with_ceiling = step, ceiling
         for name, handle in self._splats.items():
-            handle.set_gaussians(*_splats_of(thinned(view.submaps[name].cloud, step)))
+            if name in anchors:
+                cloud = self._shown_part(view.submaps[name], anchors[name])
+                handle.set_gaussians(*_splats_of(cloud))
+
+    def _shown_part(self, submap: SubmapView, pose: Pose) -> GaussianCloud:
+        """What is sent of a sub-map."""
+        cloud = thinned(submap.cloud, self._keep_every)
+        if self._with_ceiling or self._up is None or len(cloud) == 0:
+            return cloud
+        hidden = above(cloud.means, submap.path[:, :3, 3], pose[:3, :3].T @ self._up)
+        return cloud if hidden.all() else cloud.select(~hidden)
+
+    def _shown_map(self, cloud: GaussianCloud, cameras: NDArray) -> GaussianCloud:
+        """What is sent of a merged map, which was seen by cameras at (k, 3)."""
+        kept = thinned(cloud, keep_every(len(cloud), self._max_splats))
+        if self._with_ceiling or self._up is None or len(kept) == 0 or len(cameras) == 0:
+            return kept
+        hidden = above(kept.means, cameras, self._up)
+        return kept if hidden.all() else kept.select(~hidden)
 
     def _place(self, submap: SubmapView, pose: Pose) -> None:
         if submap.name not in self._splats:
-            self._add(submap)
+            self._add(submap, pose)
         position, wxyz = _position(pose), _wxyz(pose)
         for handles in (self._splats, self._anchors, self._keyframes):
             if submap.name in handles:
                 handle = handles[submap.name]
                 handle.position, handle.wxyz = position, wxyz
 
-    def _add(self, submap: SubmapView) -> None:
+    def _add(self, submap: SubmapView, pose: Pose) -> None:
         node = f"{submap.agent}/{submap.index}"
-        cloud = thinned(submap.cloud, self._keep_every)
-        centers, matrices, rgbs, opacities = _splats_of(cloud)
+        centers, matrices, rgbs, opacities = _splats_of(self._shown_part(submap, pose))
         self._splats[submap.name] = self._server.scene.add_gaussian_splats(
             f"/splats/{node}", centers, matrices, rgbs, opacities
         )
@@ -198,7 +204,7 @@ class Scene:
             if known is None or known[0] is not cloud:
                 if known is not None:
                     known[1].remove()
-                kept = thinned(cloud, keep_every(len(cloud), self._max_splats))
+                kept = self._shown_map(cloud, view.camera_positions(component))
                 handle = self._server.scene.add_gaussian_splats(
                     f"/merged/{number}", *_splats_of(kept)
                 )

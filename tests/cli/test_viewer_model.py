@@ -11,13 +11,8 @@ import pytest
 
 from magic_cli.main import run_command
 from magic_cli.viewer.detail import covariances, keep_every, thinned
-from magic_cli.viewer.panel import (
-    agents_text,
-    loop_text,
-    loop_title,
-    summary_text,
-    trajectories_zip,
-)
+from magic_cli.viewer.panel import trajectories_zip
+from magic_cli.viewer.words import agents_text, loop_text, loop_title, summary_text
 from magic_core.geometry import se3
 from magic_core.wire.records import AgentInfo, CorrectedPose, LoopCandidate
 from tests.small_world import make_submap

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import io
-import shutil
 from collections.abc import AsyncIterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import pytest_asyncio
-from PIL import Image
 
 from magic_agent.client import ClientConfig, MagicClient
 from magic_cli.viewer.feed import Feed
@@ -23,19 +19,24 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
+from tests.end_to_end.browser import (
+    CHROMIUM,
+    dismiss_notices,
+    page_in_chromium,
+    says,
+    screenshot,
+    shown_share,
+)
 from tests.small_world import DIMENSION, LARGE, MODEL_ID, look, make_submap, render
 from tests.small_world import gaussians_of as gaussians
 
-playwright = pytest.importorskip("playwright.async_api")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytest.importorskip("playwright.async_api")
 pytestmark = [
     pytest.mark.asyncio(loop_scope="module"),
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (apt-get install chromium)"),
     pytest.mark.slow,
 ]
-ARTEFACTS = Path(__file__).resolve().parents[2] / "build" / "viewer"
-BACKGROUND = np.array([22, 26, 34])
-MAP_AREA = (0, 190, 600, 600)  # left, top, right, bottom: beside the panel, below notices
+MAP_AREA = (0, 0, 1000, 900)  # left, top, right, bottom: beside the panel
 
 
 def turned_away() -> Submap:
@@ -84,40 +85,17 @@ async def shown(tmp_path_factory) -> AsyncIterator[tuple[Page, Feed, MagicClient
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def browser(shown) -> AsyncIterator:
     """The page in Chromium, with software rendering."""
-    async with playwright.async_playwright() as driver:
-        chromium = await driver.chromium.launch(
-            executable_path=CHROMIUM,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-                  "--ignore-gpu-blocklist", "--disable-quic"],
-        )  # fmt: skip
-        tab = await chromium.new_page(viewport={"width": 960, "height": 600})
-        tab.set_default_timeout(180_000)
-        await tab.goto(shown[0].address)
-        await tab.wait_for_selector("canvas")
-        await tab.wait_for_function("document.body.innerText.includes('5 sub-maps in')")
+    async with page_in_chromium(shown[0].address, width=1440, height=900) as tab:
+        await says(tab, "5 sub-maps in")
+        await dismiss_notices(tab)
         yield tab
-        await chromium.close()
-
-
-async def screenshot(tab, name: str) -> np.ndarray:
-    """A picture of the page, kept under build/viewer."""
-    ARTEFACTS.mkdir(parents=True, exist_ok=True)
-    data = await tab.screenshot(path=ARTEFACTS / f"{name}.png", timeout=180_000)
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-
-
-def shown_share(picture: np.ndarray) -> float:
-    """The share of the map's area that is not background."""
-    left, top, right, bottom = MAP_AREA
-    area = picture[top:bottom, left:right].astype(int)
-    return float((np.abs(area - BACKGROUND).max(axis=2) > 25).mean())
 
 
 async def settled_share(tab, name: str, *, least: float = 0.0, most: float = 1.0) -> float:
     """The share once the page has drawn what it was sent."""
     share = -1.0
     for _ in range(40):
-        share = shown_share(await screenshot(tab, name))
+        share = shown_share(await screenshot(tab, name), MAP_AREA)
         if least <= share <= most:
             break
         await asyncio.sleep(1.0)
@@ -134,7 +112,7 @@ async def test_splats_appear_and_go_with_their_layer(browser) -> None:
 
 async def test_agents_are_listed_with_their_health(browser) -> None:
     await browser.get_by_role("tab", name="Agents").click()
-    await browser.wait_for_function("document.body.innerText.includes('agent_2')")
+    await says(browser, "agent_2")
     text = await browser.inner_text("body")
     assert "active" in text
     assert "s ago" in text
@@ -148,7 +126,7 @@ async def test_a_rejected_loop_tells_its_reason(shown, browser) -> None:
     await browser.get_by_label("candidate", exact=True).click()
     title = f"agent_2/0 - {'/'.join(rejected.target.split('/')[3::2])}: REJECTED"
     await browser.get_by_text(title).first.click()
-    await browser.wait_for_function(f"document.body.innerText.includes('{rejected.reason}')")
+    await says(browser, rejected.reason)
     await screenshot(browser, "rejected-loop")
     assert "overlap" in await browser.inner_text("body")
 
