@@ -13,12 +13,14 @@ import errno
 import hashlib
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from magic_core.errors import CorruptData, DiskFull, NotFound
 
 _READ_BYTES = 1 << 20
+SYNCS_AT_ONCE = 8
 DISK_RETRY_S = 15.0
 """How long callers are asked to wait when the disk is full."""
 
@@ -52,7 +54,9 @@ class BlobFolder:
 
         A stored file with other content than its name says is replaced: it was damaged.
         """
-        fresh, folders = [], set()
+        written = list(written)
+        sync_all([blob.path for blob in written if not blob.synced])
+        fresh, folders = [], set[Path]()
         for blob in written:
             place = self.path(blob.sha256)
             folders.add(place.parent)
@@ -63,8 +67,7 @@ class BlobFolder:
             os.replace(blob.path, place)
             if not known:
                 fresh.append(blob.sha256)
-        for folder in folders:
-            sync_folder(folder)
+        sync_all(sorted(folders))
         return fresh
 
     def remove(self, digests: Iterable[str]) -> None:
@@ -122,6 +125,8 @@ class BlobWriter:
             self.path = folder / name
             self._file = self.path.open("ab")
         self.length = 0
+        self.synced = False
+        """Whether all that was written is on the disk."""
         self._digest = hashlib.sha256()
 
     @property
@@ -137,6 +142,7 @@ class BlobWriter:
 
     def note(self, data: bytes) -> None:
         """Count bytes that the file holds already."""
+        self.synced = False
         self._digest.update(data)
         self.length += len(data)
 
@@ -145,15 +151,9 @@ class BlobWriter:
         with translated_disk_errors():
             self._file.flush()
 
-    def sync(self) -> None:
-        """What was written to the disk: it survives a loss of power."""
-        with translated_disk_errors():
-            self._file.flush()
-            os.fsync(self._file.fileno())
-
     def finish(self) -> None:
-        """Everything to the disk; nothing can be appended afterwards."""
-        self.sync()
+        """Nothing is appended afterwards; `BlobFolder.adopt` brings it to the disk."""
+        self.flush()
         self._file.close()
 
     def close(self) -> None:
@@ -207,13 +207,16 @@ def _digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable."""
-    sync_file(folder)
+def sync_all(paths: Sequence[Path]) -> None:
+    """Make files and folders durable, several at a time: a disk takes them in one go."""
+    with ThreadPoolExecutor(SYNCS_AT_ONCE, thread_name_prefix="magic-sync") as threads:
+        for done in [threads.submit(_sync, path) for path in paths]:
+            with translated_disk_errors():
+                done.result()
 
 
-def sync_file(path: Path) -> None:
-    """Make what was written to a file or folder durable."""
+def _sync(path: Path) -> None:
+    """Make what was written to a file, or the names in a folder, durable."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -25,6 +25,7 @@ from magic_server.store.agents import AgentTable
 from magic_server.store.archive import ArchiveTable, ImportedSubmap
 from magic_server.store.blobs import BlobFolder, BlobWriter, SharedBlobFolder
 from magic_server.store.commit_lock import CommitLock, SharedCommitLock
+from magic_server.store.committing import SubmapCommits
 from magic_server.store.database import Database
 from magic_server.store.deletions import Deletions
 from magic_server.store.engines import engine_of
@@ -75,6 +76,9 @@ class Store:
         self.maps = MapTable(self._database)
         self.usage = UsageTable(self._database)
         self.archive = ArchiveTable(self._database)
+        self._commits = SubmapCommits(
+            self.submaps, self.blobs, lock=self._commit_lock, threads=threads
+        )
         self.deletions = Deletions(
             self._database, self.blobs, lock=self._commit_lock, threads=threads
         )
@@ -121,6 +125,7 @@ class Store:
 
     async def close(self) -> None:
         """Close the database and give the folder free."""
+        await self._commits.close()
         await self._database.close()
         while self._lock_files:
             os.close(self._lock_files.pop())
@@ -133,18 +138,7 @@ class Store:
         Returns what was answered before when another request stored the same sub-map meanwhile.
         Nothing is left behind when it fails.
         """
-        loop = asyncio.get_running_loop()
-        async with self._commit_lock:  # nobody else may come to rely on blobs that are taken back
-            first = await self.submaps.first_answer(agent, submap.vertex.index)
-            if first is not None:
-                return first
-            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
-            try:
-                await self.submaps.insert(agent, submap, now=now)
-            except BaseException:
-                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
-                raise
-        return None
+        return await self._commits.add(agent, submap, written, now=now)
 
     async def add_map(
         self,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 import sqlalchemy as sa
+from sqlalchemy.ext.asyncio import AsyncConnection
 
 from magic_core.errors import NotFound
 from magic_core.submap import Descriptor, OdometryEdge
@@ -49,6 +51,21 @@ class FirstAnswer:
     stored_bytes: int
 
 
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """A sub-map that has come as a whole."""
+
+    agent: AgentRow
+    submap: NewSubmap
+    at: float
+    """When, seconds since the epoch."""
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """What no two sub-maps share: row id of the agent, and number."""
+        return self.agent.id, self.submap.vertex.index
+
+
 class SubmapTable:
     """Sub-maps, their headers and which blobs they hold."""
 
@@ -56,28 +73,30 @@ class SubmapTable:
         self._database = database
         self._blobs = blobs
 
-    async def insert(self, agent: AgentRow, submap: NewSubmap, *, now: float) -> None:
-        """The one transaction that makes a sub-map part of its session.
+    async def insert(self, arrivals: Sequence[Arrival]) -> None:
+        """The one transaction that makes sub-maps part of their sessions: all of them, or none.
 
-        NotFound when its agent was deleted meanwhile.
+        NotFound when the agent of one was deleted meanwhile.
         """
-        async with self._database.write(agent.session.id) as connection:
-            mine = sa.select(agents.c.id).where(agents.c.id == agent.id)
-            if await connection.scalar(mine) is None:
-                name = names.agent_name(agent.session.name, agent.name)
-                raise NotFound(f"{name} was deleted while it submitted a sub-map")
-            values = submap_columns(agent.session.id, agent.id, submap)
-            values |= {"received_at": now, "searched": False}
-            added = await connection.execute(sa.insert(submaps), values)
-            key = added.inserted_primary_key
-            assert key is not None  # the table has an integer primary key
-            rows = [
-                {"submap_id": key[0], "position": position, "sha256": digest}
-                for position, digest in enumerate(submap.digests)
-            ]
-            await connection.execute(sa.insert(submap_blobs), rows)
-            seen = sa.update(agents).where(agents.c.id == agent.id).values(last_seen_at=now)
-            await connection.execute(seen)
+        sessions = {arrival.agent.session.id for arrival in arrivals}
+        async with self._database.write(*sessions) as connection:
+            for arrival in arrivals:
+                await _insert(connection, arrival)
+
+    async def first_answers(
+        self, arrivals: Sequence[Arrival]
+    ) -> dict[tuple[int, int], FirstAnswer]:
+        """The first answers of those that are stored already, deleted or not, by their places."""
+        places = [arrival.place for arrival in arrivals]
+        found: dict[tuple[int, int], FirstAnswer] = {}
+        async with self._database.read() as connection:
+            for table in (submaps, removed_submaps):
+                place = (table.c.agent_id, table.c.number)
+                columns = (table.c[field.name] for field in fields(FirstAnswer))
+                query = sa.select(*place, *columns).where(sa.tuple_(*place).in_(places))
+                for row in await connection.execute(query):
+                    found[row.agent_id, row.number] = FirstAnswer(*row[2:])
+        return found
 
     async def first_answer(self, agent: AgentRow, index: int) -> FirstAnswer | None:
         """The answer that a sub-map got when it was stored, deleted or not, or None."""
@@ -159,6 +178,25 @@ class SubmapTable:
         if row is None:
             raise NotFound(f"{names.submap_name(session.name, agent, index)} is not stored")
         return _info(session, row)
+
+
+async def _insert(connection: AsyncConnection, arrival: Arrival) -> None:
+    """The rows of one sub-map; NotFound without its agent."""
+    agent, submap = arrival.agent, arrival.submap
+    seen = sa.update(agents).where(agents.c.id == agent.id).values(last_seen_at=arrival.at)
+    if not (await connection.execute(seen)).rowcount:
+        name = names.agent_name(agent.session.name, agent.name)
+        raise NotFound(f"{name} was deleted while it submitted a sub-map")
+    values = submap_columns(agent.session.id, agent.id, submap)
+    values |= {"received_at": arrival.at, "searched": False}
+    added = await connection.execute(sa.insert(submaps), values)
+    key = added.inserted_primary_key
+    assert key is not None  # the table has an integer primary key
+    rows = [
+        {"submap_id": key[0], "position": position, "sha256": digest}
+        for position, digest in enumerate(submap.digests)
+    ]
+    await connection.execute(sa.insert(submap_blobs), rows)
 
 
 def _is(session: SessionRow, agent: str, index: int) -> sa.ColumnElement[bool]:

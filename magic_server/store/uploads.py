@@ -26,7 +26,7 @@ from magicslam.v1 import submap_pb2
 
 from magic_core.errors import MagicError
 from magic_core.wire import ChunkCursor
-from magic_server.store.blobs import BlobWriter, sync_file, sync_folder, translated_disk_errors
+from magic_server.store.blobs import BlobWriter, sync_all, translated_disk_errors
 from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
@@ -102,16 +102,18 @@ class PartialUpload:
 
     def sync(self) -> None:
         """Everything that has come so far to the disk."""
-        with translated_disk_errors():
-            if not self.cursor.done and self.cursor.position[1]:
-                self.blobs[-1].sync()
-            os.fsync(self._journal.fileno())
-            if not self._named:
-                sync_file(self.folder / _META)
-                sync_folder(self.folder.parent)
-                self._named = True
-            sync_folder(self.folder)
+        unsynced = [blob for blob in self.blobs if not blob.synced]
+        sync_all([*(blob.path for blob in unsynced), *self._own_files()])
+        sync_all([self.folder] if self._named else [self.folder, self.folder.parent])
+        for blob in unsynced:
+            blob.synced = True
+        self._named = True
         self._unsynced = 0
+
+    def _own_files(self) -> list[Path]:
+        """What tells the next server of the blobs and is not on the disk."""
+        journal, meta = self.folder / _JOURNAL, self.folder / _META
+        return [journal] if self._named else [journal, meta]
 
     def pause(self) -> None:
         """Nobody sends at present: everything to the disk, no file stays open."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import errno
 import hashlib
 import os
@@ -207,6 +208,66 @@ async def test_blobs_are_synced_and_named_before_the_transaction(
     files = len(blobs)
     expected = ["fsync"] * files + ["replace"] * files + ["fsync"] * len(folders)
     assert events == [*expected, "transaction"]
+
+
+async def test_submaps_that_wait_together_are_committed_together(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounds: list[int] = []
+    insert = store.submaps.insert
+
+    async def counted(arrivals):
+        rounds.append(len(arrivals))
+        await insert(arrivals)
+
+    monkeypatch.setattr(store.submaps, "insert", counted)
+    agents = [await registered(store, f"agent_{number}") for number in range(12)]
+    ended: list[str] = []
+
+    async def add(number: int) -> None:
+        made, blobs = new_submap(make_submap(agent=number), store)
+        assert await store.add_submap(agents[number], made, blobs, now=2.0) is None
+        ended.append(made.vertex.name)
+
+    await asyncio.gather(*(add(number) for number in range(12)))
+    assert sum(rounds) == 12
+    assert len(rounds) <= 2  # the first, and all who came meanwhile
+    vertices = await store.submaps.vertices(agents[0].session)
+    assert [vertex.name for vertex in vertices] == ended  # told in the order of the rows
+
+
+async def test_nobody_fails_for_another_of_the_same_commit(store: Store) -> None:
+    agents = [await registered(store, f"agent_{number}") for number in range(3)]
+    made = [new_submap(make_submap(agent=number), store) for number in range(3)]
+    kept = {blob.sha256 for number in (0, 2) for blob in made[number][1]}
+    broken = dataclasses.replace(made[1][0], digests=NO_DIGESTS)
+    first, second, third = await asyncio.gather(
+        *(
+            store.add_submap(agent, submap, blobs, now=2.0)
+            for agent, submap, blobs in zip(
+                agents, (made[0][0], broken, made[2][0]), (m[1] for m in made), strict=True
+            )
+        ),
+        return_exceptions=True,
+    )
+    assert first is None
+    assert third is None
+    assert isinstance(second, Exception)
+    vertices = await store.submaps.vertices(agents[0].session)
+    assert [vertex.name for vertex in vertices] == [made[0][0].vertex.name, made[2][0].vertex.name]
+    assert set(store.blobs.names()) == kept  # those of the broken one are taken back
+
+
+async def test_of_one_submap_by_two_requests_at_once_the_first_is_stored(store: Store) -> None:
+    agent = await registered(store)
+    twice = [new_submap(make_submap(), store) for _ in range(2)]
+    answers = await asyncio.gather(
+        *(store.add_submap(agent, made, blobs, now=2.0) for made, blobs in twice)
+    )
+    assert answers[0] is None
+    assert answers[1] is not None
+    assert answers[1].request_id == "r"
+    assert len(await store.submaps.vertices(agent.session)) == 1
 
 
 async def test_a_damaged_file_is_not_relied_on_and_is_replaced(store: Store) -> None:
