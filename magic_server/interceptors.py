@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
@@ -9,11 +11,14 @@ import grpc
 import grpc.aio
 from google.protobuf.message import DecodeError
 
-from magic_core.errors import InvalidInput
+from magic_core.errors import InvalidInput, MagicError
 from magic_server.access import OPEN_TO_ALL
 from magic_server.calls import CallDesk
 
 Context = grpc.aio.ServicerContext
+
+DISCARD_S, DISCARD_MESSAGES = 0.5, 64
+"""How long, and how much, is read on of a stream whose answer is known before its end."""
 
 
 class CallInterceptor(grpc.aio.ServerInterceptor):
@@ -47,8 +52,10 @@ class CallInterceptor(grpc.aio.ServerInterceptor):
 
         async def single(request: Any, context: Context) -> Any:
             async with self._desk.handling(method, context, _whole(request, streamed)) as call:
-                given = call.authorised(_readable(request)) if streamed else _require(request)
-                answer = await behaviour(given, context)
+                if not streamed:
+                    answer = await behaviour(_require(request), context)
+                else:
+                    answer = await _answered(behaviour, call.authorised, request, context)
                 call.count(answer)
                 return answer
 
@@ -100,6 +107,37 @@ async def _readable(requests: AsyncIterator[Any]) -> AsyncIterator[Any]:
     """The messages of a stream; InvalidInput at the first that does not parse."""
     async for request in requests:
         yield _require(request)
+
+
+async def _answered(
+    behaviour: Callable[..., Any],
+    authorised: Callable[[AsyncIterator[Any]], AsyncIterator[Any]],
+    requests: AsyncIterator[Any],
+    context: Context,
+) -> Any:
+    """The answer to a stream; given, or refused, once the caller has sent what it was sending."""
+    try:
+        answer = await behaviour(authorised(_readable(requests)), context)
+    except MagicError:
+        await _discarded(requests)
+        raise
+    await _discarded(requests)
+    return answer
+
+
+async def _discarded(requests: AsyncIterator[Any]) -> None:
+    """Read on for a moment.
+
+    The connection of a caller that is cut off while it sends may lose the answer: gRPC tells it of
+    an "Internal error from Core" instead.
+    """
+    count = 0
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(DISCARD_S):
+            async for _ in requests:
+                count += 1
+                if count == DISCARD_MESSAGES:
+                    return
 
 
 _KINDS: dict[tuple[bool, bool], tuple[str, Any]] = {

@@ -3,10 +3,11 @@
     python -m tests.faults.network --runs 20 --seed 1 --json
 
 A run is one server behind a proxy with one kind of weather, and four agents that send two sub-maps
-of about 5 MB each at once. Every kind of weather takes its turn: clear (the measure of time and
-bytes), delays that let connections overtake each other, throttling, cuts within chunks, refused
-connections, links that fall silent, and all of it. Afterwards every sub-map must be there once and
-byte for byte. Exits with 1 when one is not, or when a run took longer than its bound.
+of about 3 MB each at once. Every kind of weather takes its turn: clear (the measure of time and
+bytes), delays that let connections overtake each other, throttling, a slow link, cuts within
+chunks, refused connections, links that fall silent, and all of it. Afterwards every sub-map must be
+there once and byte for byte. Exits with 1 when one is not, when a run took longer than its bound,
+or when bytes were sent again over a link that was not cut.
 """
 
 from __future__ import annotations
@@ -35,11 +36,15 @@ KEEPALIVE_TIMEOUT_S = 2.0
 RETRY_S = 1.0
 """Longest pause between attempts."""
 
+NEEDLESS = 0.01
+"""Share of bytes that pings and repeated calls may add to a link that was never cut."""
+
 CUT = (200_000, 5_000_000)
 WEATHERS = {
     "clear": Weather(),
     "delayed": Weather(delay_s=0.03),
     "throttled": Weather(bytes_per_s=6_000_000.0),
+    "slow": Weather(bytes_per_s=300_000.0),
     "cut": Weather(cut_after=CUT, cuts=12),
     "refused": Weather(cut_after=CUT, cuts=6, refuse=0.3),
     "silent": Weather(cut_after=CUT, cuts=4, silent=1.0),
@@ -78,12 +83,15 @@ class Figures:
     damaged: int = 0
     over_bound: int = 0
     """Runs that took longer than their bound."""
+    resent_needlessly: int = 0
+    """Runs without a cut in which bytes were sent again."""
     kinds: dict[str, Kind] = field(default_factory=dict)
     seconds: float = 0.0
 
     @property
     def good(self) -> bool:
-        return not (self.lost or self.duplicated or self.damaged or self.over_bound)
+        stored_wrongly = self.lost or self.duplicated or self.damaged
+        return not (stored_wrongly or self.over_bound or self.resent_needlessly)
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +221,7 @@ async def campaign(
             seen[name].append(run)
             figures.runs += 1
             figures.over_bound += _lost_s(run, weathers[name], seen) > lost_time_bound_s(run)
+            figures.resent_needlessly += not run.cuts and _resent(run, seen) > NEEDLESS
             figures.kinds = {
                 kind: _kind(seen[kind], weathers[kind], seen) for kind in weathers if seen[kind]
             }
@@ -228,6 +237,11 @@ def _lost_s(run: Run, weather: Weather, seen: dict[str, list[Run]]) -> float:
     throttled = run.bytes_up / AGENTS / weather.bytes_per_s if weather.bytes_per_s else 0.0
     delayed = pieces * weather.delay_s / 2
     return max(0.0, run.seconds - clear - 1.5 * (throttled + delayed))
+
+
+def _resent(run: Run, seen: dict[str, list[Run]]) -> float:
+    """Bytes beyond those of the least of the clear runs, relative to them."""
+    return run.bytes_up / min(one.bytes_up for one in seen["clear"]) - 1.0
 
 
 def _kind(runs: list[Run], weather: Weather, seen: dict[str, list[Run]]) -> Kind:
