@@ -3,21 +3,26 @@
 A recording of the generated flat is replayed by agents that only send, into a server in a process
 of its own that searches, verifies and solves as always. Reports the rate against plain synced
 writes of the same bytes to the same disk, the times of calls under that load, how the server's
-memory grows, and how often its event loop stood still for more than 50 ms.
+memory grows, and how often its event loop stood still for more than 50 ms. Ctrl-C, SIGTERM or
+`--seconds` end it early, with the figures so far.
 
 Examples:
   magic bench server --submaps 200
-  magic bench server --json
+  magic bench server --seconds 300 --json
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +31,7 @@ from magic_cli.output import console, print_json, table
 from magic_core.errors import ConfigError, Unavailable
 
 STOP_TIMEOUT_S = 60.0
+SAID_EVERY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +44,8 @@ class ServerBenchmark:
     """Sub-maps they submit together."""
     folder: Path | None = None
     """Where they are stored and the plain files are written; a temporary folder by default."""
+    seconds: float = 0.0
+    """No more sub-maps are submitted after this long; 0 for no limit."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -48,6 +56,8 @@ class ServerBenchmark:
             raise ConfigError.field(
                 "submaps", f"{self.submaps}: expected at least one for each of {self.agents} agents"
             )
+        if not 0 <= self.seconds < float("inf"):
+            raise ConfigError.field("seconds", f"{self.seconds}: expected 0 or more")
 
 
 def main(arguments: list[str]) -> int:
@@ -67,32 +77,41 @@ def main(arguments: list[str]) -> int:
 
 
 def _measured(config: ServerBenchmark, folder: Path) -> dict:
-    from magic_cli.benchmarks.server_load import plain_write, run_load
+    from magic_cli.benchmarks.server_load import Load, plain_write, run_load
     from magic_cli.benchmarks.server_recording import record
 
-    with console.status("recording") as status:
-        recording = record(lambda share: status.update(f"recording: {share:.0%}"))
-        child = _start(folder / "store")
-        try:
-            load = asyncio.run(
-                run_load(
-                    _line_of(child)["address"],
+    said = Said()
+    said("recording")
+    recording = record(lambda share: said(f"recording: {share:.0%}"))
+    child = _start(folder / "store")
+    try:
+        address = _line_of(child)["address"]
+
+        async def loaded() -> Load:
+            async with _told_to_stop(config.seconds) as stop:
+                return await run_load(
+                    address,
                     recording,
                     agents=config.agents,
                     submaps=config.submaps,
                     server_pid=child.pid,
-                    progress=lambda share: status.update(f"submitting: {share:.0%}"),
+                    progress=lambda load: said(load.line()),
+                    stop=stop,
                 )
-            )
-        finally:
-            seen = _stopped(child)
-        status.update("writing the same bytes to plain files")
-        each = load.sent_bytes // load.submaps
-        disk_s = plain_write(folder / "plain", [each] * load.submaps)
+
+        load = asyncio.run(loaded())
+    finally:
+        seen = _stopped(child)
+    if not load.submaps:
+        raise Unavailable("no sub-map was stored before the end; give it more time")
+    said("writing the same bytes to plain files", at_once=True)
+    each = load.sent_bytes // load.submaps
+    disk_s = plain_write(folder / "plain", [each] * load.submaps)
     rate, disk_rate = (load.sent_bytes / 1e6 / seconds for seconds in (load.seconds, disk_s))
     return {
         "agents": config.agents,
         "submaps": load.submaps,
+        "complete": load.submaps == config.submaps,
         "mb_per_s": rate,
         "disk_mb_per_s": disk_rate,
         "ratio": rate / disk_rate,
@@ -109,11 +128,41 @@ def _measured(config: ServerBenchmark, folder: Path) -> dict:
     }
 
 
+class Said:
+    """Says how far it is: now and then, because it may end in a log."""
+
+    def __init__(self) -> None:
+        self._last_s = float("-inf")
+
+    def __call__(self, text: str, *, at_once: bool = False) -> None:
+        if at_once or time.monotonic() - self._last_s >= SAID_EVERY_S:
+            self._last_s = time.monotonic()
+            console.print(text)
+
+
+@contextlib.asynccontextmanager
+async def _told_to_stop(seconds: float) -> AsyncIterator[asyncio.Event]:
+    """Set by SIGINT, SIGTERM, and after so many seconds where there is a limit."""
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    for number in numbers:
+        loop.add_signal_handler(number, stop.set)
+    timer = loop.call_later(seconds, stop.set) if seconds else None
+    try:
+        yield stop
+    finally:
+        if timer is not None:
+            timer.cancel()
+        for number in numbers:
+            loop.remove_signal_handler(number)
+
+
 def _start(store: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "magic_cli.benchmarks.server_child", str(store)],
         stdout=subprocess.PIPE,
         text=True,
+        start_new_session=True,  # Ctrl-C is for the benchmark, which then stops the server
     )
 
 

@@ -38,6 +38,14 @@ class Load:
     server_cpu_s: float = 0.0
     client_cpu_s: float = 0.0
 
+    def line(self) -> str:
+        """How far it is, in a line."""
+        rate = self.submaps / self.seconds if self.seconds else 0.0
+        memory = self.memory[-1][1] / 1e6 if self.memory else 0.0
+        return (
+            f"{self.submaps} sub-maps in {self.seconds:.0f} s, {rate:.1f}/s, server {memory:.0f} MB"
+        )
+
     def percentiles_ms(self) -> dict[str, dict[str, float]]:
         """p50 and p99 of each call, milliseconds."""
         return {
@@ -51,7 +59,9 @@ class Load:
 
     def growth_bytes_per_submap(self) -> float:
         """Slope of the server's resident memory over the sub-maps it stored, after the warm-up."""
-        samples = np.array([m for m in self.memory if m[0] >= WARM_UP_SHARE * self.submaps])
+        samples = np.array(
+            [m for m in self.memory if WARM_UP_SHARE * self.submaps <= m[0] <= self.submaps]
+        )
         if len(samples) < 3 or np.ptp(samples[:, 0]) == 0:
             return float("nan")
         return float(np.polyfit(samples[:, 0], samples[:, 1], 1)[0])
@@ -64,9 +74,13 @@ async def run_load(
     agents: int,
     submaps: int,
     server_pid: int,
-    progress: Callable[[float], None],
+    progress: Callable[[Load], None],
+    stop: asyncio.Event,
 ) -> Load:
-    """`agents` connections submit `submaps` sub-maps together; a reader asks all the while."""
+    """`agents` connections submit `submaps` sub-maps together; a reader asks all the while.
+
+    Ends early, with what there is, once `stop` is set.
+    """
     load = Load()
     server = psutil.Process(server_pid)
     cpu = _cpu_of(server), time.process_time()
@@ -77,17 +91,23 @@ async def run_load(
             group.create_task(_ask(address, recording, load)),
             group.create_task(_sample(server, load)),
         ]
-        async with asyncio.TaskGroup() as uploads:
-            for agent, share in enumerate(shares):
-                work = _submit(address, recording, load, agent=agent, count=len(share))
-                uploads.create_task(work)
-            shower = group.create_task(_show(load, submaps, progress))
+        watchers.append(group.create_task(_show(load, started, progress)))
+        uploads = group.create_task(_submit_all(address, recording, load, shares))
+        stopping = group.create_task(stop.wait())
+        await asyncio.wait((uploads, stopping), return_when=asyncio.FIRST_COMPLETED)
         load.seconds = time.perf_counter() - started
-        for watcher in (*watchers, shower):
-            watcher.cancel()
+        for task in (*watchers, uploads, stopping):
+            task.cancel()
     load.server_cpu_s = _cpu_of(server) - cpu[0]
     load.client_cpu_s = time.process_time() - cpu[1]
     return load
+
+
+async def _submit_all(address: str, recording: Recording, load: Load, shares: list[range]) -> None:
+    async with asyncio.TaskGroup() as group:
+        for agent, share in enumerate(shares):
+            work = _submit(address, recording, load, agent=agent, count=len(share))
+            group.create_task(work)
 
 
 async def _submit(
@@ -133,9 +153,10 @@ async def _sample(server: psutil.Process, load: Load) -> None:
         await asyncio.sleep(SAMPLE_EVERY_S)
 
 
-async def _show(load: Load, submaps: int, progress: Callable[[float], None]) -> None:
+async def _show(load: Load, started: float, progress: Callable[[Load], None]) -> None:
     while True:
-        progress(load.submaps / submaps)
+        load.seconds = time.perf_counter() - started
+        progress(load)
         await asyncio.sleep(SAMPLE_EVERY_S)
 
 
