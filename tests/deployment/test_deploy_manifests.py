@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,30 @@ def test_an_image_copies_what_exists_and_starts_what_magic_understands(name: str
     assert isinstance(config, ServeCommand)
     (asked,) = re.findall(r"http://127\.0\.0\.1:(\d+)/readyz", text)
     assert config.metrics.port == int(asked)
+
+
+@pytest.mark.slow
+def test_what_an_image_installs_holds_every_file_of_the_packages(tmp_path: Path) -> None:
+    context, root = tmp_path / "context", DEPLOY.parent
+    context.mkdir()
+    copied = re.findall(r"^COPY (.+) \S+$", (DEPLOY / "Dockerfile").read_text(), re.MULTILINE)
+    ignored = shutil.ignore_patterns("__pycache__")
+    for source in (root / name for names in copied for name in names.split()):
+        if source.is_dir():
+            shutil.copytree(source, context / source.name, ignore=ignored)
+        else:
+            shutil.copy(source, context)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--no-deps", "--wheel-dir", tmp_path, "."],
+        cwd=context, check=True, capture_output=True,
+    )  # fmt: skip
+    (wheel,) = tmp_path.glob("magic_slam-*.whl")
+    installed = set(zipfile.ZipFile(wheel).namelist())
+    for folder in (*context.glob("magic_*"), context / "proto" / "magicslam"):
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        assert files
+        for file in files:
+            assert file.relative_to(folder.parent).as_posix() in installed
 
 
 def test_the_compose_file_follows_its_schema() -> None:
