@@ -22,7 +22,8 @@ from tests.documentation.pages import (
 from tests.documentation.scenes import ELSEWHERE, PARSED, RUN
 
 PLACEHOLDER = re.compile(r"\b(COMMAND|NAME|WHAT)\b")
-WITH_SETTINGS = ("run", "serve", "agent", "view", "doctor", "check-data", "export", "render")
+WITH_SETTINGS = ("run", "serve", "agent", "view", "doctor", "check-data", "export", "render",
+                 "worker")  # fmt: skip
 OF_OTHERS = {
     "--gpus", "--profile", "--runs", "--insecure-tokens",
 }  # fmt: skip

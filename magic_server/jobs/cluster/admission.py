@@ -7,6 +7,7 @@ every job of the server demands. A worker that cannot do the work is thus never 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import socket
@@ -34,7 +35,10 @@ def mark(folder: Path) -> str:
     if not place.exists():
         partial = folder / f"{ID_FILE}.{uuid.uuid4().hex}.partial"
         partial.write_text(uuid.uuid4().hex)
-        partial.replace(place)
+        # A link, since another server of the same folder may do this too: the first one stays.
+        with contextlib.suppress(FileExistsError):
+            os.link(partial, place)
+        partial.unlink()
     return place.read_text().strip()
 
 

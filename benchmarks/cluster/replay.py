@@ -1,0 +1,138 @@
+"""The sub-maps of a finished run, sent again in the same order: where does an engine put them?
+
+Agents that track at the same time never send their sub-maps in quite the same order twice, and the
+order decides which pairs are compared. So two engines are compared on a replay: each sub-map is
+sent once everything that followed from the one before is settled.
+
+Examples:
+  magic run DATASET --out runs/office
+  python benchmarks/cluster/replay.py runs/office --out pool.npz
+  dask scheduler --port 8786 &
+  magic worker tcp://127.0.0.1:8786 &
+  magic worker tcp://127.0.0.1:8786 &
+  python benchmarks/cluster/replay.py runs/office --out dask.npz --scheduler tcp://127.0.0.1:8786 \\
+      --compare pool.npz
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import tempfile
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magic_agent.client import MagicClient
+from magic_core.wire import EncodedSubmap, names
+from magic_server.config import ListenConfig, ServerConfig
+from magic_server.jobs import JobConfig
+from magic_server.server import Server
+
+SETTLED_TIMEOUT_S = 900.0
+OnSubmap = Callable[[int], Awaitable[None]]
+
+
+async def recorded(server_folder: Path) -> tuple[dict[str, Any], list[EncodedSubmap]]:
+    """How agents register, and the sub-maps of a run's session in the order of their arrival."""
+    config = ServerConfig(data_dir=server_folder, listen=ListenConfig(port=0))
+    async with Server(config) as server, MagicClient(server.address) as client:
+        (session,) = await client.list_sessions()
+        model = {"model_id": session.descriptor_model_id, "dimension": session.descriptor_dimension}
+        found = await client.list_submaps(session.name.rpartition("/")[2])
+        in_order = sorted(found, key=lambda submap: (submap.received_at, submap.name))
+        return model, [await client.download_encoded(submap.name) for submap in in_order]
+
+
+async def _nothing(_: int) -> None:
+    pass
+
+
+async def replay(
+    model: dict[str, Any],
+    submaps: list[EncodedSubmap],
+    config: ServerConfig,
+    *,
+    on_submap: OnSubmap = _nothing,
+) -> dict[str, Any]:
+    """world_from_anchor (4, 4) of every sub-map, the loops' verdicts, and how long it took.
+
+    `on_submap` hears the number of each sub-map when it has been sent, before it is settled.
+    """
+    started = time.perf_counter()
+    async with Server(config) as server, MagicClient(server.address) as client:
+        registered = set()
+        for number, encoded in enumerate(submaps):
+            session, agent, _ = names.parse_submap(encoded.header.name)
+            if agent not in registered:
+                await client.register_agent(session, agent, **model)
+                registered.add(agent)
+            await client.submit_encoded(encoded)
+            await on_submap(number)
+            coordinator = await server.sessions.named(session)
+            if not await coordinator.idle(SETTLED_TIMEOUT_S):
+                raise TimeoutError(f"{encoded.header.name} was not settled in time")
+        poses = (await client.get_corrected_poses(session)).poses
+        answer = await client.list_loops(session)
+    return {
+        "poses": {name: pose.world_from_anchor for name, pose in poses.items()},
+        "loops": {f"{c.source} {c.target}": c.verdict for c in answer.candidates},
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def difference(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, float]:
+    """The largest differences of two sets of poses of the same sub-maps."""
+    if one.keys() != other.keys():
+        raise ValueError(f"different sub-maps: {sorted(one.keys() ^ other.keys())}")
+    relative = [np.linalg.inv(one[name]) @ other[name] for name in one]
+    skew = [0.5 * (r[:3, :3] - r[:3, :3].T) for r in relative]  # its norm is exact near 0
+    return {
+        "translation_m": max(float(np.linalg.norm(r[:3, 3])) for r in relative),
+        "rotation_rad": max(float(np.linalg.norm(s) / np.sqrt(2.0)) for s in skew),
+    }
+
+
+def main() -> None:
+    """Replay a run and print what came of it as JSON."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="run folder of `magic run`")
+    parser.add_argument("--scheduler", default="", help="of a Dask cluster; default: the pool")
+    parser.add_argument("--data-dir", type=Path, help="of the new server; default: a temporary one")
+    parser.add_argument("--out", type=Path, required=True, help="file for the poses, .npz")
+    parser.add_argument("--compare", type=Path, help="poses of another replay")
+    options = parser.parse_args()
+    jobs = JobConfig()
+    if options.scheduler:
+        jobs = JobConfig(executor="dask", scheduler=options.scheduler)
+    with tempfile.TemporaryDirectory() as scratch:
+        config = ServerConfig(
+            data_dir=options.data_dir or Path(scratch), listen=ListenConfig(port=0), jobs=jobs
+        )
+        made = asyncio.run(_main(options.run, config))
+    np.savez(options.out, **made["poses"])
+    verdicts = list(made["loops"].values())
+    report = {
+        "submaps": len(made["poses"]),
+        "loops": {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))},
+        "seconds": round(made["seconds"], 1),
+    }
+    if options.compare:
+        with np.load(options.compare) as other:
+            report["difference"] = difference(made["poses"], dict(other))
+    print(json.dumps(report))
+
+
+async def _main(run: Path, config: ServerConfig) -> dict[str, Any]:
+    model, submaps = await recorded(run / "server")
+    return await replay(model, submaps, config)
+
+
+if __name__ == "__main__":
+    main()
