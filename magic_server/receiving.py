@@ -188,6 +188,8 @@ class SubmapReceiver:
     async def _taken(self, upload: Upload, messages: Messages, claim: _Claim) -> None:
         """Receive what is missing. A broken stream leaves what came; a refusal leaves nothing."""
         claim.taking = asyncio.create_task(self._take(upload, messages))
+        if claim.gave_way:  # asked for before there was anything to end
+            claim.taking.cancel()
         try:
             await claim.taking
         except DeadlineExceeded:
@@ -272,8 +274,8 @@ class _Claim:
 
     def give_way(self) -> None:
         """End receiving for another stream; what is being committed is committed."""
-        if self.taking is not None and not self.taking.done():
-            self.gave_way = True
+        self.gave_way = True
+        if self.taking is not None:
             self.taking.cancel()
 
 

@@ -176,6 +176,30 @@ async def test_a_new_stream_takes_over_from_one_that_looks_alive(
     assert len(await registered.list_submaps("room")) == 1
 
 
+async def test_a_stream_that_is_only_being_admitted_gives_way_too(
+    registered: MagicClient, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver, entered, go = server._receiver, asyncio.Event(), asyncio.Event()
+    admit = receiver._require_admission
+
+    async def held(*given):
+        entered.set()
+        await go.wait()
+        await admit(*given)
+
+    monkeypatch.setattr(receiver, "_require_admission", held)
+    stale = asyncio.create_task(send(server, messages(encoded())[:1], hold=True))
+    await entered.wait()
+    (claim,) = receiver._claims.values()
+    asking = asyncio.create_task(registered.resume_upload(NAME, "first"))
+    await eventually(lambda: claim.gave_way)
+    go.set()
+    async with asyncio.timeout(server.config.limits.upload_idle_s / 2):
+        assert (await asking).durable_bytes == 0
+    with pytest.raises(Unavailable, match="taken over"):
+        await stale
+
+
 async def test_a_stream_from_the_beginning_starts_over(
     registered: MagicClient, server: Server
 ) -> None:
