@@ -38,7 +38,8 @@ class AgentCommand(AgentConfig):
     """Which recording of the dataset, and the agent's name on the server. Where the dataset holds
     a single recording, any name will do."""
     server: str = "127.0.0.1:50051"
-    """Address of the server."""
+    """Address of the server; of several that share a database, with commas: a:50051,b:50051. The
+    agent follows its session from one to the other."""
     session: str = "default"
     """Agents of one session map one place together."""
     out: Path = Path("runs/agents")

@@ -20,7 +20,7 @@ import numpy as np
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core import logs, tracing
-from magic_core.errors import CorruptData, DiskFull
+from magic_core.errors import CorruptData, DiskFull, Unavailable
 from magic_core.wire import names, records
 from magic_server.config import ServerConfig
 from magic_server.graph import SessionGraph
@@ -244,7 +244,7 @@ class SessionCoordinator:
                 with self._about(vertex.name, "search loops"):
                     async with self._editing:
                         await self._search(vertex)
-            except DiskFull as error:
+            except (DiskFull, Unavailable) as error:
                 await self._wait_for_room(error)
                 self._arrived.appendleft(vertex)
             except Exception:
@@ -328,7 +328,7 @@ class SessionCoordinator:
                 self._metrics.loops.labels(settled.reason).inc()
                 if settled.verdict == "ACCEPTED":
                     self._solving.wake()
-            except DiskFull as error:
+            except (DiskFull, Unavailable) as error:
                 await self._wait_for_room(error)
                 self._pending.appendleft(loop)
             except Exception:

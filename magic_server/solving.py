@@ -17,7 +17,7 @@ from concurrent.futures import Executor
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core import logs, tracing
-from magic_core.errors import DiskFull
+from magic_core.errors import DiskFull, Unavailable
 from magic_server.graph import SessionGraph
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import solve_pose_graph
@@ -109,7 +109,7 @@ class Solving:
             try:
                 async with self._editing:
                     await self._take_in()
-            except DiskFull as error:
+            except (DiskFull, Unavailable) as error:
                 logger.warning("%s: %s", self._session.name, error)
                 await self._try_again()
             except Exception:

@@ -104,7 +104,7 @@ class PostgresServer:
 def postgres_server() -> Iterator[PostgresServer]:
     """A server on a free port while the block runs; NoPostgres where none can be started."""
     programs = _programs()
-    folder = Path(tempfile.mkdtemp(prefix="magic-postgres-"))
+    folder = Path(tempfile.mkdtemp(prefix="magic-postgres-", dir=_roomy()))
     try:
         _give_away(folder)
         (folder / "password").write_text(PASSWORD)
@@ -132,6 +132,13 @@ def postgres_server() -> Iterator[PostgresServer]:
         raise NoPostgres(f"{error} {said[-500:]!r}") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _roomy() -> str | None:
+    """A folder in memory where there is one with room: databases are many small files."""
+    memory = Path("/dev/shm")
+    roomy = memory.is_dir() and shutil.disk_usage(memory).free > 2 << 30
+    return str(memory) if roomy and os.access(memory, os.W_OK) else None
 
 
 def _programs() -> Path:

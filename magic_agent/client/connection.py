@@ -18,17 +18,20 @@ from magicslam.v1 import global_map_service_pb2_grpc as map_grpc
 from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 
+from magic_agent.client.targets import Targets
 from magic_core.errors import MagicError, Unavailable
 from magic_core.wire import (
     ClientCredentials,
     SubmapEncoding,
     Transport,
-    client_options,
     error_of,
-    open_channel,
 )
 
 _T = TypeVar("_T")
+TURNS = 50
+"""Attempts at least where there are several servers."""
+TURN_S = 0.5
+"""Longest wait between them, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +67,18 @@ class ClientConfig:
 
 
 class Connection:
-    """A channel to a server and what all calls over it share."""
+    """A connection to a server, or to those of several that work on what is asked.
+
+    `target` is HOST:PORT, or several with commas between them: servers that share a database. Calls
+    follow a session from server to server.
+    """
 
     def __init__(self, target: str, config: ClientConfig = ClientConfig()) -> None:
         self.target = target
         self._closed = False
         self.config = config
-        opened: Any = open_channel(target, config.credentials, client_options(config.transport))
-        self._channel: grpc.aio.Channel = opened.channel
+        opened: Any = Targets(target, credentials=config.credentials, transport=config.transport)
+        self._targets: Targets = opened
         self.mapping_stub = mapping_grpc.MappingServiceStub(opened)
         self.map_stub = map_grpc.GlobalMapServiceStub(opened)
         self.session_stub = session_grpc.SessionServiceStub(opened)
@@ -92,7 +99,7 @@ class Connection:
         """Wait until the server answers; Unavailable when it does not in time."""
         try:
             async with asyncio.timeout(self.config.connect_timeout_s):
-                await self._channel.channel_ready()
+                await self._targets.ready()
         except TimeoutError as error:
             waited = self.config.connect_timeout_s
             raise Unavailable(
@@ -103,7 +110,7 @@ class Connection:
     async def _diagnosis(self) -> str:
         """What gRPC says of the connection: a refused port, or a certificate and what is wrong."""
         try:
-            await health_pb2_grpc.HealthStub(self._channel).Check(
+            await health_pb2_grpc.HealthStub(self._targets.channel).Check(
                 health_pb2.HealthCheckRequest(), timeout=2.0
             )
         except grpc.aio.AioRpcError as failure:
@@ -113,7 +120,7 @@ class Connection:
     async def close(self) -> None:
         """Close the connection; calls under way are cancelled."""
         self._closed = True
-        await self._channel.close(grace=None)
+        await self._targets.close()
 
     async def idempotent(
         self,
@@ -164,11 +171,20 @@ class Connection:
         """
         asked_s = error.retry_after_s
         passing = isinstance(error, Unavailable) or asked_s is not None
-        if not passing or failures + 1 >= self.config.attempts:
+        at_once = self._targets.turn(error)
+        several = self._targets.several
+        attempts = self.config.attempts
+        if several:  # a lost server's sessions are with another after some seconds
+            attempts = max(attempts, TURNS)
+        if not passing or failures + 1 >= attempts:
             raise error
+        if at_once:
+            return
         if asked_s is not None and asked_s > self.config.max_asked_s:
             raise error
         pause = min(self.config.backoff_s * 2**failures, self.config.max_backoff_s)
+        if several:
+            pause = min(pause, TURN_S)
         pause *= random.uniform(0.5, 1.0)
         # A little later than asked: of many who wait, not all come back in the same instant.
         await asyncio.sleep(max(pause, (asked_s or 0.0) * random.uniform(1.0, 1.2)))

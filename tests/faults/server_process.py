@@ -108,9 +108,11 @@ def _say(event: str, **values: Any) -> None:
 
 def _config(settings: dict[str, Any]):
     from magic_core.wire import Transport
+    from magic_server.cluster_config import ClusterConfig
     from magic_server.config import ListenConfig, ServerConfig
     from magic_server.jobs import JobConfig
     from magic_server.loops import LoopConfig
+    from magic_server.store_config import StoreConfig
 
     loops = LoopConfig(
         min_similarity=settings.get("min_similarity", 1.0), top_k=settings.get("top_k", 6)
@@ -121,6 +123,8 @@ def _config(settings: dict[str, Any]):
     )
     return ServerConfig(
         data_dir=Path(settings["data_dir"]),
+        store=StoreConfig(database=settings.get("database", "")),
+        cluster=ClusterConfig(replica=settings.get("replica", "")),
         listen=ListenConfig(port=settings.get("port", 0), stop_grace_s=2.0, transport=transport),
         jobs=JobConfig(workers=1, niceness=settings.get("niceness", 0)),
         loops=loops,
