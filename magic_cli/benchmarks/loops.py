@@ -3,6 +3,8 @@
 Takes every n-th frame of each agent as an anchor, registers every pair with each method, and
 compares with the overlap that the true poses give. Several datasets at once also test every pair
 across them, which must all be refused.
+
+Example: magic bench loops ../shared/data/redkitchen ../shared/data/living_room_3agents --every 50
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ class LoopsBenchmark:
     """Every n-th frame of an agent is an anchor."""
     scale: float = 0.5
     """Process images at this fraction of their size."""
+    keyframes: int = 4
+    """So many later frames, 10 apart, come with each anchor, as a sub-map's keyframes do; 0: the
+    anchors alone."""
     methods: tuple[str, ...] = ("visual", "visual+kiss", "kiss", "fpfh", "means")
     """Coarse registration methods, `+` joins those that are tried together."""
     models: tuple[str, ...] = ("efficientnet_lite0",)
@@ -47,6 +52,7 @@ def main(arguments: list[str]) -> int:
             describers={name: load_descriptor_model(name).describe for name in config.models},
             every=config.every,
             scale=config.scale,
+            keyframes=config.keyframes,
             progress=lambda share, text: status.update(f"{text}: {share:.0%} of the pairs"),
         )
     console.print(_verification(result))

@@ -32,12 +32,11 @@ def mates(loops: EdgeArrays, chains: Chains, *, scale: float = 1.0) -> NDArray[n
     `scale` widens all standard deviations.
     """
     count = len(loops)
-    first, second = np.divmod(np.arange(count * count), max(count, 1))
+    first, second = np.triu_indices(count, k=1)
     agree = _Cycles(loops, chains).miss(first, second) < MATE_CHI_SQUARE * scale**2
-    found = agree.reshape(count, count)
-    found = found | found.T
-    np.fill_diagonal(found, False)
-    return found
+    found = np.zeros((count, count), dtype=bool)
+    found[first[agree], second[agree]] = True
+    return found | found.T
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +94,21 @@ class _Cycles:
         self.loops, self.chains = loops, chains
         self.variance_m2, self.variance_rad2 = loops.variances()
         self.votes_inverse = stacked.inverse(votes(loops, chains))
-        target_inverse = stacked.inverse(chains.poses[loops.target])
-        self.left = loops.source_from_target @ target_inverse
-        self.right = chains.poses[loops.source]
+        left = loops.source_from_target @ stacked.inverse(chains.poses[loops.target])
+        right = chains.poses[loops.source]
+        # A cycle is left @ votes_inverse @ right. Only its length and its angle are asked for,
+        # which do not change when the rotation of `left` goes around to the other side.
+        self.turn = right[:, :3, :3] @ left[:, :3, :3]
+        self.offset = (left[:, :3, :3].swapaxes(1, 2) @ left[:, :3, 3:])[..., 0]
+        self.start = right[:, :3, 3]
 
     def miss(self, k: NDArray[np.int64], other: NDArray[np.int64]) -> Array:
         """Squared Mahalanobis norms of the cycles of loops k and other, index arrays alike."""
-        # What the other loop says where loop k measured: identity if they agree.
-        missed = self.left[k] @ self.votes_inverse[other] @ self.right[k]
+        vote = self.votes_inverse[other]
+        missed_m = np.einsum("nij,nj->ni", vote[:, :3, :3], self.start[k])
+        missed_m += vote[:, :3, 3] + self.offset[k]
+        trace = np.einsum("nij,nji->n", self.turn[k], vote[:, :3, :3])
+        missed_rad = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
         ends = self.loops.source, self.loops.target
         positions = self.chains.poses[:, :3, 3]
         apart = [np.linalg.norm(positions[end[k]] - positions[end[other]], axis=1) for end in ends]
@@ -113,8 +119,7 @@ class _Cycles:
         spread_m2 = drift_m2 + self.variance_m2[k] + self.variance_m2[other]
         spread_m2 = spread_m2 + lever_rad2 * distance_m**2
         spread_rad2 = drift_rad2 + self.variance_rad2[k] + self.variance_rad2[other]
-        miss = (missed[:, :3, 3] ** 2).sum(axis=1) / spread_m2
-        return miss + stacked.rotation_angles(missed) ** 2 / spread_rad2
+        return (missed_m**2).sum(axis=1) / spread_m2 + missed_rad**2 / spread_rad2
 
     def _drift(
         self, drift: Array, reach: Array, k: NDArray[np.int64], other: NDArray[np.int64]

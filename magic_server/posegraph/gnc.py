@@ -20,6 +20,7 @@ from magic_server.posegraph.optimiser import (
     anchored,
     chordal_start,
     optimise,
+    poses_of,
     values_of,
 )
 
@@ -33,8 +34,14 @@ LAST_MU = 0.5
 """Here loops count up to 3 times beyond their bound; the polish then cuts at the bound."""
 MAX_ROUNDS = 30
 LEAST_WEIGHT = 1e-3
+SAME_WEIGHTS = 0.005
+"""A round whose weights differ from the last one's by less than this on average is left out."""
+ROUGHLY = 1e-3
+"""Rounds whose optimum is not the end result stop once they gain less than this share."""
+FINELY = 1e-7
+"""Near the optimum an iteration that gains less than this has arrived."""
 POLISH_ROUNDS = 5
-POLISH_ITERATIONS = 2
+POLISH_ITERATIONS = 1
 FINAL_ITERATIONS = 50
 SEED_ITERATIONS = 6
 
@@ -46,13 +53,15 @@ class Annealing:
     step: float
     """Factor of the control parameter mu from round to round."""
     iterations: int
-    """Levenberg-Marquardt iterations per round."""
+    """Iterations per round."""
 
 
 CAREFUL = Annealing(step=2.0, iterations=2)
 """From a start that drift may have carried far away."""
 SWIFT = Annealing(step=2.0, iterations=1)
 """From a start that most loops agree with already."""
+ROUGH = Annealing(step=4.0, iterations=1)
+"""Of what is annealed again in a larger whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +79,8 @@ class RobustGraph:
     def __init__(self, odometry: EdgeArrays, loops: EdgeArrays, anchors: dict[int, Array]) -> None:
         self.odometry = odometry
         self.loops = loops
+        self.anchors = anchors
+        self._last: tuple[Array, gtsam.Values] | None = None
         self._loop_factors = FactorCache(loops)
         self._base = anchored(anchors)
         odometry_factors = FactorCache(odometry)
@@ -81,7 +92,17 @@ class RobustGraph:
     ) -> Array:
         """Optimise with the loops' weights (m,); weights below LEAST_WEIGHT are dropped."""
         graph = self._weighted(weights)
-        return optimise(graph, poses, max_iterations=max_iterations, tolerance=tolerance)
+        start = self._values(poses)
+        values = optimise(graph, start, max_iterations=max_iterations, tolerance=tolerance)
+        found = poses_of(values, len(poses))
+        self._last = found, values
+        return found
+
+    def _values(self, poses: Array) -> gtsam.Values:
+        """GTSAM's copy of the poses; that of the last result is still at hand."""
+        if self._last is not None and self._last[0] is poses:
+            return self._last[1]
+        return values_of(poses)
 
     def _weighted(self, weights: Array) -> gtsam.NonlinearFactorGraph:
         graph = self._base.clone()
@@ -117,15 +138,21 @@ def graduated(
     allowed = np.ones(len(graph.loops), bool) if candidates is None else candidates
     start = poses
     if seed is not None:
-        poses = graph.solve(poses, seed.astype(float), max_iterations=SEED_ITERATIONS)
+        poses = graph.solve(
+            poses, seed.astype(float), max_iterations=SEED_ITERATIONS, tolerance=ROUGHLY
+        )
     squared = graph.loops.squared_norms(poses)
     largest = float(squared[allowed].max(initial=0.0))
     if largest > limit:
         mu = max(limit / max(2.0 * largest - limit, 1e-9), LEAST_MU)
+        solved_with = np.full(len(squared), np.inf)
         for _ in range(MAX_ROUNDS):
             weights = np.where(allowed, _weights(squared, mu, limit), 0.0)
-            poses = graph.solve(poses, weights, max_iterations=annealing.iterations)
-            squared = graph.loops.squared_norms(poses)
+            if np.abs(weights - solved_with).mean() > SAME_WEIGHTS:
+                poses = graph.solve(
+                    poses, weights, max_iterations=annealing.iterations, tolerance=ROUGHLY
+                )
+                squared, solved_with = graph.loops.squared_norms(poses), weights
             if mu >= LAST_MU:
                 break
             mu *= annealing.step
@@ -138,21 +165,27 @@ def polished(
     *,
     limit: float,
     start: Array | None = None,
+    kept: NDArray[np.bool_] | None = None,
     final: bool = True,
 ) -> GncResult:
-    """Alternate between keeping what fits and solving with it, until nothing changes."""
+    """Alternate between keeping what fits and solving with it, until nothing changes.
+
+    `kept` (m,) are the loops to begin with; without them, those that fit the poses.
+    """
     start = poses if start is None else start
-    kept = graph.loops.squared_norms(poses) < limit
+    kept = graph.loops.squared_norms(poses) < limit if kept is None else kept
     for _ in range(POLISH_ROUNDS):
         poses = graph.solve(
-            poses, kept.astype(float), max_iterations=POLISH_ITERATIONS, tolerance=1e-5
+            poses, kept.astype(float), max_iterations=POLISH_ITERATIONS, tolerance=ROUGHLY
         )
         fits = graph.loops.squared_norms(poses) < limit
         if (fits == kept).all():
             break
         kept = fits
     if final:
-        poses = graph.solve(poses, kept.astype(float), max_iterations=FINAL_ITERATIONS)
+        poses = graph.solve(
+            poses, kept.astype(float), max_iterations=FINAL_ITERATIONS, tolerance=FINELY
+        )
     return GncResult(poses=poses, kept=kept, start=start)
 
 

@@ -1,4 +1,4 @@
-"""The border to GTSAM: our arrays in, Levenberg-Marquardt, our arrays out.
+"""The border to GTSAM: our arrays in, second-order optimisation, our arrays out.
 
 GTSAM orders tangent vectors (rotation, translation); ours are (translation, rotation). They are
 permuted here and nowhere else.
@@ -26,7 +26,7 @@ class FactorCache:
 
     def __init__(self, edges: EdgeArrays) -> None:
         self._edges = edges
-        self._information = _gtsam_information(edges.information)
+        self._square_root = _square_root(_gtsam_information(edges.information))
         self._measured = [gtsam.Pose3(matrix) for matrix in edges.source_from_target]
         self._unit: dict[int, gtsam.BetweenFactorPose3] = {}
 
@@ -42,7 +42,8 @@ class FactorCache:
         return self._unit[index]
 
     def _make(self, index: int, weight: float) -> gtsam.BetweenFactorPose3:
-        noise = gtsam.noiseModel.Gaussian.Information(weight * self._information[index])
+        root = self._square_root[index]
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * root)
         edges = self._edges
         return gtsam.BetweenFactorPose3(
             int(edges.source[index]), int(edges.target[index]), self._measured[index], noise
@@ -50,19 +51,29 @@ class FactorCache:
 
 
 def optimise(
-    graph: gtsam.NonlinearFactorGraph, poses: Array, *, max_iterations: int, tolerance: float = 1e-9
-) -> Array:
-    """Levenberg-Marquardt from poses (n, 4, 4); the result's error is never above the start's."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(max_iterations)
-    parameters.setRelativeErrorTol(tolerance)
-    parameters.setAbsoluteErrorTol(1e-9)
-    start = values_of(poses)
-    try:
-        result = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-    except RuntimeError:
-        return poses
-    return poses_of(result, len(poses))
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    *,
+    max_iterations: int,
+    tolerance: float = 1e-9,
+) -> gtsam.Values:
+    """Gauss-Newton, or Levenberg-Marquardt where that does not go down, from given poses.
+
+    The result's error is never above the start's.
+    """
+    least = graph.error(start)
+    for kind in ("GaussNewton", "LevenbergMarquardt"):
+        parameters = getattr(gtsam, f"{kind}Params")()
+        parameters.setMaxIterations(max_iterations)
+        parameters.setRelativeErrorTol(tolerance)
+        parameters.setAbsoluteErrorTol(1e-9)
+        try:
+            result = getattr(gtsam, f"{kind}Optimizer")(graph, start, parameters).optimize()
+        except RuntimeError:  # not positive definite without damping
+            continue
+        if graph.error(result) <= least:
+            return result
+    return start
 
 
 def anchored(anchors: dict[int, Array]) -> gtsam.NonlinearFactorGraph:
@@ -101,6 +112,13 @@ def poses_of(values: gtsam.Values, count: int) -> Array:
     poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
     poses[:, :3, 3] = rows[:, 9:12]
     return poses
+
+
+def _square_root(information: Array) -> Array:
+    """Upper triangular R (m, 6, 6) with R^T R the information."""
+    if not len(information):
+        return information
+    return np.linalg.cholesky(information).swapaxes(1, 2)
 
 
 def _gtsam_information(information: Array) -> Array:

@@ -3,7 +3,8 @@
 1. Every loop asks its neighbours (consistency): those that disagree are not trusted at first.
 2. Every odometry chain is solved with its own trusted loops, which takes most of its drift out.
 3. Chains are placed by the consensus of the loops between them (placement).
-4. Graduated non-convexity over all trusted loops, then everything that fits is taken up.
+4. Graduated non-convexity over all trusted loops (in a large graph: with short runs of vertices
+   as rigid bodies), then everything that fits is taken up.
 All of it again with wider bounds where that explains the loops better (noise was understated).
 """
 
@@ -16,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph.arrays import connected_sets
+from magic_server.posegraph.bodies import bodies_of
 from magic_server.posegraph.chains import Chains, shortened
 from magic_server.posegraph.consistency import LocalSupport, local_support, odometry_miss
 from magic_server.posegraph.gnc import (
+    ROUGH,
     SWIFT,
     GncResult,
     RobustGraph,
@@ -41,6 +44,8 @@ CONTINUED_FROM = 300
 """Smaller graphs are solved from the start every time: that takes no longer than a blink."""
 CONTINUED_SHARE = 0.7
 """An earlier solution that explains fewer loops than this is no start."""
+BODIES = 1000
+"""Graphs of twice as many vertices are annealed as this many rigid runs."""
 DRIFT_SIGMAS = 3.0
 MAX_SCALE = 8.0
 NEAR_MISS_SHARE = 0.1
@@ -118,7 +123,35 @@ class RobustSolver:
             return graduated(graph, start, limit=limit, seed=seed, candidates=trusted)
         chains = self._straightened(support, trusted, limit)
         start = self._placed(chains, trusted, scale=scale)
+        coarse = self._annealed_as_bodies(replace(chains, poses=start), trusted, limit)
+        if coarse is not None:
+            return polished(graph, coarse.poses, limit=limit, start=start, kept=coarse.kept)
         return graduated(graph, start, limit=limit, seed=None, candidates=trusted, annealing=SWIFT)
+
+    def _annealed_as_bodies(self, placed: Chains, trusted: Mask, limit: float) -> GncResult | None:
+        """Poses and loops by the motion of short runs of vertices; None for a small graph."""
+        graph, count = self._graph, len(placed.poses)
+        if count < 2 * BODIES:
+            return None
+        bodies = bodies_of(graph.odometry, graph.loops, placed, -(-count // BODIES))
+        if bodies is None:
+            return None
+        inside = bodies.loops.source == bodies.loops.target
+        between = np.flatnonzero(~inside)
+        anchors = bodies.held(graph.anchors)
+        small = RobustGraph(bodies.odometry, bodies.loops.select(between), anchors)
+        result = graduated(
+            small,
+            placed.poses[bodies.first],
+            limit=limit,
+            seed=None,
+            candidates=trusted[between],
+            annealing=SWIFT,
+            final=False,
+        )
+        kept = trusted & inside
+        kept[between] = result.kept
+        return GncResult(bodies.spread(result.poses), kept, placed.poses)
 
     def _lacks_witness(self, support: LocalSupport, scale: float) -> Mask:
         """Loops that alone would move a map farther than one witness may."""
@@ -167,7 +200,7 @@ class RobustSolver:
         sizes = support.cluster_size[inside]
         seed = sizes >= SEED_SHARE * sizes.max()
         start = self._chains.poses[members]
-        return graduated(alone, start, limit=limit, seed=seed, final=False)
+        return graduated(alone, start, limit=limit, seed=seed, annealing=ROUGH, final=False)
 
     def _description_cost(self, result: GncResult, scale: float) -> float:
         """Negative log-likelihood (nats, up to a constant) of noise `scale` times the claimed.

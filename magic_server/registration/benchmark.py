@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core.data import open_dataset
+from magic_core.data import FrameSource, open_dataset
 from magic_core.errors import DataError
 from magic_core.gaussians.seeding import seed_uniform
 from magic_core.geometry import Camera, se3
@@ -32,6 +32,8 @@ LOOP_OVERLAP = 0.3
 WANTED_RECALL = 0.95
 """What a calibrated threshold of similarity finds of these."""
 STRIDE = 3
+KEYFRAME_STEP = 10
+"""Frames between the keyframes of an anchor."""
 SEEDED_SHARE = 0.25
 """Gaussians per pixel of the method `means`."""
 DEPTH_TOLERANCE_M = 0.08
@@ -71,17 +73,24 @@ def run(
     describers: Mapping[str, Describe] | None = None,
     every: int = 30,
     scale: float = 0.5,
+    keyframes: int = 0,
     config: RegistrationConfig | None = None,
     criteria: Criteria | None = None,
     progress: Progress = lambda share, text: None,
 ) -> dict[str, Any]:
     """Register every pair of anchors with each set of methods, and compare with ground truth.
 
+    `keyframes` are later images, KEYFRAME_STEP frames apart, that each anchor brings along.
+
     Returns `anchors`, `detection` per descriptor model, `verification` per set of methods
     (precision, recall by overlap, errors of what was accepted, seconds) and all `pairs`.
     """
     paths = [dataset] if isinstance(dataset, (str, Path)) else list(dataset)
-    anchors = [anchor for path in paths for anchor in load_anchors(path, every=every, scale=scale)]
+    anchors = [
+        anchor
+        for path in paths
+        for anchor in load_anchors(path, every=every, scale=scale, keyframes=keyframes)
+    ]
     config, criteria = config or RegistrationConfig(), criteria or Criteria()
     index = [(i, j) for i in range(len(anchors)) for j in range(i)]
     overlaps = [true_overlap(anchors[i], anchors[j]) for i, j in index]
@@ -111,19 +120,46 @@ def run(
     }
 
 
-def load_anchors(dataset: Path | str, *, every: int, scale: float) -> list[Anchor]:
-    """Every n-th frame of each agent, with its true pose."""
+def load_anchors(
+    dataset: Path | str, *, every: int, scale: float, keyframes: int = 0
+) -> list[Anchor]:
+    """Every n-th frame of each agent, with its true pose, and some frames that follow it."""
     found = []
     for source in open_dataset(dataset, scale=scale):
         for number in range(0, len(source), every):
             frame = source[number]
-            if frame.world_from_camera is None:
-                raise DataError(f"{dataset}: {source.name} has no ground truth poses")
             means = _seeded_means(source.camera, frame.colour, frame.depth)
-            view = AnchorView(source.camera, frame.colour, frame.depth, means=means)
+            view = AnchorView(
+                source.camera,
+                frame.colour,
+                frame.depth,
+                _following(source, number, keyframes),
+                means=means,
+            )
             name = str(Path(str(dataset)).name)
-            found.append(Anchor(name, source.name, number, frame.world_from_camera, view))
+            found.append(Anchor(name, source.name, number, _true_pose(source, number), view))
     return found
+
+
+def _following(
+    source: FrameSource, anchor: int, count: int
+) -> tuple[tuple[Array, NDArray[np.uint8], NDArray[np.float32]], ...]:
+    """Frames after an anchor as a sub-map's keyframes, at their true poses."""
+    anchor_from_world = se3.inverse(_true_pose(source, anchor))
+    numbers = [anchor + KEYFRAME_STEP * (k + 1) for k in range(count)]
+    return tuple(
+        (anchor_from_world @ _true_pose(source, number), frame.colour, frame.depth)
+        for number in numbers
+        if number < len(source)
+        for frame in (source[number],)
+    )
+
+
+def _true_pose(source: FrameSource, number: int) -> Array:
+    pose = source[number].world_from_camera
+    if pose is None:
+        raise DataError(f"{source.name}: frame {number} has no ground truth pose")
+    return pose
 
 
 def _seeded_means(

@@ -12,7 +12,15 @@ from magic_core.errors import ConfigError, InvalidInput
 from magic_core.geometry import se3
 from magic_server.posegraph import Edge, PoseGraphConfig, PoseGraphProblem, stacked
 from magic_server.posegraph.arrays import EdgeArrays
-from magic_server.posegraph.optimiser import FactorCache, anchored, optimise, values_of
+from magic_server.posegraph.bodies import bodies_of
+from magic_server.posegraph.chains import follow
+from magic_server.posegraph.optimiser import (
+    FactorCache,
+    anchored,
+    optimise,
+    poses_of,
+    values_of,
+)
 from magic_server.posegraph.simulated import (
     INFORMATION,
     SIGMAS,
@@ -317,8 +325,57 @@ def test_optimise_never_ends_above_its_start():
     for index in range(len(edges)):
         graph.add(cache.factor(index))
     start = np.array(list(truth.values()))
-    found = optimise(graph, start, max_iterations=30)
+    found = poses_of(optimise(graph, values_of(start), max_iterations=30), len(start))
     assert edges.squared_norms(found).sum() <= edges.squared_norms(start).sum()
+
+
+def test_gauss_newton_that_goes_up_gives_way_to_damped_steps():
+    """Far from the optimum a whole step overshoots; the result must still go down."""
+    generator = np.random.default_rng(3)
+    truth = [random_pose(generator, 2.0) for _ in range(12)]
+    pairs = [(i, j) for i in range(12) for j in range(i)]
+    edges = EdgeArrays(
+        np.array([i for i, _ in pairs]),
+        np.array([j for _, j in pairs]),
+        np.array([se3.inverse(truth[i]) @ truth[j] for i, j in pairs]),
+        np.tile(INFORMATION, (len(pairs), 1, 1)),
+    )
+    graph = anchored({0: truth[0]})
+    cache = FactorCache(edges)
+    for index in range(len(edges)):
+        graph.add(cache.factor(index))
+    starts = [np.array([truth[0], *(random_pose(generator, 2.0) for _ in range(11))])
+              for _ in range(10)]  # fmt: skip
+    for start in starts:
+        found = poses_of(optimise(graph, values_of(start), max_iterations=5), len(start))
+        assert edges.squared_norms(found).sum() < 0.9 * edges.squared_norms(start).sum()
+
+
+def test_loops_between_bodies_say_what_they_say_between_vertices():
+    simulation = agents_in_a_hall(agents=2, submaps=30, loops=40)
+    number = {name: index for index, name in enumerate(simulation.problem.vertices)}
+    odometry = EdgeArrays.of(simulation.problem.odometry, number)
+    loops = EdgeArrays.of(simulation.problem.loops, number)
+    truth = np.array(list(simulation.truth.values()))
+    placed = replace(follow(len(number), odometry), poses=truth)
+    bodies = bodies_of(odometry, loops, placed, 5)
+    assert bodies is not None
+    assert len(bodies.first) == 12
+    assert len(bodies.odometry) == 10
+    assert np.allclose(bodies.spread(truth[bodies.first]), truth)
+    # At the true poses every loop misses by its own noise, and may miss by more than before.
+    fine, coarse = loops.squared_norms(truth), bodies.loops.squared_norms(truth[bodies.first])
+    at_first = np.isin(loops.source, bodies.first) & np.isin(loops.target, bodies.first)
+    assert (coarse <= fine * (1 + 1e-9)).all()
+    assert np.allclose(coarse[at_first], fine[at_first])
+
+
+def test_bodies_need_simple_chains():
+    simulation = agents_in_a_hall(agents=1, submaps=12, loops=4)
+    number = {name: index for index, name in enumerate(simulation.problem.vertices)}
+    odometry = EdgeArrays.of(simulation.problem.odometry, number)
+    forked = replace(odometry, source=np.where(odometry.source == 7, 3, odometry.source))
+    assert bodies_of(forked, odometry, follow(12, forked), 5) is None
 
 
 def test_odometry_floor_widens_optimistic_edges_only():
