@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from magic_cli.main import run_command
 from magic_core.errors import ConfigError, CorruptData, Unavailable
 from magic_core.gaussians import codec
 from magic_core.tracing import TracingConfig
@@ -176,6 +177,24 @@ async def test_a_scheduler_that_is_started_again_gets_the_jobs_again(tmp_path: P
 
 
 @pytest.mark.slow
+async def test_a_worker_that_is_told_to_stop_ends_its_job_and_leaves_in_peace(
+    tmp_path: Path,
+) -> None:
+    with running_cluster(tmp_path / "cluster") as cluster:
+        cluster.start_worker("tired")
+        async with dask_jobs(cluster, tmp_path) as jobs:
+            running = asyncio.create_task(jobs.run(pid_once_there, tmp_path / "go"))
+            await eventually((tmp_path / "go.waiting").exists)
+            tired = cluster.workers.pop("tired")
+            tired.terminate()
+            assert await asyncio.to_thread(tired.wait, 30.0) == 0
+            assert not alive(waited(tmp_path / "go")[0])
+            (tmp_path / "go").touch()
+            cluster.start_worker("rested")
+            assert await running == waited(tmp_path / "go")[1]
+
+
+@pytest.mark.slow
 async def test_a_server_that_is_killed_leaves_no_job_running(tmp_path: Path) -> None:
     script = (
         "import asyncio, sys\n"
@@ -256,6 +275,34 @@ async def test_certificates_keep_strangers_out(tmp_path: Path) -> None:
 def test_settings_that_cannot_work_are_refused(settings: dict, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         JobConfig(**settings)
+
+
+def test_without_dask_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)  # as if it were not installed
+    config = JobConfig(executor="dask", scheduler="tcp://h:8786")
+    with pytest.raises(ConfigError, match=r"pip install 'magic-slam\[cluster\]'"):
+        new_executor(config, folder=tmp_path, trace=TracingConfig(), observer=lambda *_: None)
+    pool = new_executor(
+        JobConfig(), folder=tmp_path, trace=TracingConfig(), observer=lambda *_: None
+    )
+    assert pool.slots == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["10.0.0.5:8786"], "expected tcp://HOST:PORT"),
+        (["tls://h:8786"], "needs tls.ca, .certificate and .key"),
+        (["tcp://h:8786", "--resources", "gpu"], "expected NAME=AMOUNT"),
+        (["tcp://h:8786", "--data-dir", "nowhere"], "mount the server's data folder first"),
+        (["tcp://h:8786", "--processes", "0"], "processes and threads are at least 1"),
+    ],
+)
+def test_a_worker_that_cannot_work_says_so_at_once(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["worker", *arguments]) == 2
+    assert complaint in capsys.readouterr().err
 
 
 def test_certificates_that_cannot_be_read_are_named(tmp_path: Path) -> None:

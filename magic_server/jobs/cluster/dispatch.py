@@ -277,7 +277,7 @@ class Dispatch:
         address = self._config.scheduler
         port = address.rpartition(":")[2]
         return (
-            f"no Dask scheduler can be used at {address} ({error or type(error).__name__}); start "
+            f"no Dask scheduler can be used at {address} ({str(error) or type(error).__name__}); start "
             f"one there (dask scheduler --port {port}), or correct jobs.scheduler"
         )
 

@@ -109,7 +109,7 @@ class Roster:
             async with asyncio.timeout(ANSWER_S):
                 answers = await client.run(admit, *question, workers=[address], on_error="return")
         except (OSError, TimeoutError) as error:
-            return f"{address} does not answer ({error or 'timeout'})"
+            return f"{address} does not answer ({str(error) or 'timeout'})"
         answer = answers.get(address, "it went away")
         if isinstance(answer, Exception):
             remedy = "is magic-slam[cluster] of this server's version installed there?"
