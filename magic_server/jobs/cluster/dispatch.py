@@ -274,10 +274,10 @@ class Dispatch:
         looked.set()
 
     def _no_scheduler(self, error: Exception) -> str:
-        address = self._config.scheduler
+        address, why = self._config.scheduler, str(error) or type(error).__name__
         port = address.rpartition(":")[2]
         return (
-            f"no Dask scheduler can be used at {address} ({str(error) or type(error).__name__}); start "
+            f"no Dask scheduler can be used at {address} ({why}); start "
             f"one there (dask scheduler --port {port}), or correct jobs.scheduler"
         )
 
