@@ -35,7 +35,7 @@ PATIENCE_S = 900
 @pytest.fixture(scope="module")
 def office(tmp_path_factory) -> Path:
     """A recording per agent, as somebody would have it in a folder of their own."""
-    config = SyntheticConfig(agents=2, frames=30, width=320, height=240, detail="draft")
+    config = SyntheticConfig(agents=2, frames=24, width=320, height=240, detail="draft")
     return write_replica(synthetic_flat(config), tmp_path_factory.mktemp("recordings") / "office")
 
 
