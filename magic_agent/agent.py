@@ -14,6 +14,7 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +32,11 @@ from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.spool import Spool
 from magic_agent.tally import Tally
 from magic_agent.uplink import Finished, Uplink
+from magic_agent.warmup import warm_up_slam
 from magic_core.data import UNLIMITED, EndOfFrames, Frame, FrameSource
 from magic_core.errors import DeadlineExceeded, Unavailable
 from magic_core.evaluation import WireBytes
 from magic_core.geometry import se3
-from magic_core.render import warm_up
 from magic_core.submap import Submap
 from magic_core.wire import names
 from magic_core.wire.records import CorrectedPose, PoseSnapshot, SubmapReceipt
@@ -171,7 +172,9 @@ class Agent:
     async def _read_frames(self, begin: int) -> None:
         loop = asyncio.get_running_loop()
         if self._pace is not None:  # a live camera does not wait for kernels to be loaded
-            await loop.run_in_executor(self._slam_thread, warm_up)
+            describe = self._model.describe
+            load = partial(warm_up_slam, self._config, describe=describe)
+            await loop.run_in_executor(self._slam_thread, load)
         for number in range(begin, len(self._source)):
             if self._stopping.is_set():
                 break

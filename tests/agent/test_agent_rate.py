@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from magic_agent import warmup
 from magic_agent.agent import Agent
 from magic_agent.config import AgentConfig
 from magic_agent.mapping import MappingConfig
+from magic_agent.slam import LocalSlam
 from magic_agent.slam_config import SubmapConfig
 from magic_agent.tally import Tally
 from magic_cli.evaluation import agent_metrics
@@ -53,6 +55,23 @@ class Walk:
 
     def __iter__(self):
         return iter(self._frames)
+
+
+def test_warming_up_goes_through_an_anchor_a_tracked_and_a_lost_frame(monkeypatch):
+    results, described = [], []
+
+    class Watched(LocalSlam):
+        def process(self, frame, **options):
+            results.append(super().process(frame, **options))
+            return results[-1]
+
+    monkeypatch.setattr(warmup, "LocalSlam", Watched)
+    warmup.warm_up_slam(CONFIG, describe=lambda colour: described.append(1) or thumbnail(colour))
+    assert [result.lost for result in results] == [False, False, True]
+    assert results[0].is_keyframe
+    assert results[1].tracked is not None
+    assert results[1].tracked.verdict == "ok"
+    assert described
 
 
 async def live(source: Walk, client, tmp_path, rate_hz: float) -> Tally:
