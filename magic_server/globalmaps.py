@@ -7,6 +7,7 @@ import dataclasses
 import logging
 import shutil
 import time
+from collections import Counter
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -284,9 +285,16 @@ def chosen_poses(
     """
     if not snapshot.poses:
         raise WrongState(f"{snapshot.session} has no corrected sub-maps yet; nothing to merge")
-    wanted = component or snapshot.components[0].id
+    wanted = component or _largest_component(snapshot)
     wanted = next((pose.component for pose in snapshot.poses if pose.submap == wanted), wanted)
     chosen = [pose for pose in snapshot.poses if pose.component == wanted]
     if not chosen:
         raise NotFound(f"{snapshot.session} has no component {component!r}")
     return chosen
+
+
+def _largest_component(snapshot: mapping_pb.PoseSnapshot) -> str:
+    """The component with most sub-maps: the first in the list, or counted while none is listed."""
+    if snapshot.components:
+        return snapshot.components[0].id
+    return Counter(pose.component for pose in snapshot.poses).most_common(1)[0][0]
