@@ -154,7 +154,8 @@ class Mapper:
     @property
     def least_s(self) -> float:
         """Seconds below which a keyframe is not worth beginning: seeding, pruning and the least
-        number of steps, as the last keyframe had them. 0 before the first."""
+        number of steps, as the last keyframe had them. Anchors tell what a step takes, but not
+        what seeding does: theirs is of the whole image. 0 before the first anchor."""
         return self._overhead_s + self._config.least_iterations * self._step_s
 
     def lacks(
@@ -214,7 +215,8 @@ class Mapper:
         ended = self._clock()
         pruned = self._prune()
         duration_s = self._clock() - started
-        self._overhead_s = duration_s - (ended - began)
+        if len(self._keyframes) > 1:
+            self._overhead_s = duration_s - (ended - began)
         self._step_s = (ended - began) / max(iterations, 1)
         return MappingReport(seeded, pruned, iterations, cut, loss, len(self), 1e3 * duration_s)
 

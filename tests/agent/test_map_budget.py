@@ -70,8 +70,10 @@ def test_a_mapper_learns_what_a_keyframe_takes_at_least():
     new = mapper()
     assert new.least_s == 0.0
     new.begin(FRAME)
-    # Four looks around seeding, steps and pruning, and one before each of the twelve steps.
-    assert new.least_s == pytest.approx(0.02 + 3 * 0.13 / 12)
+    steps_s = 3 * 0.13 / 12  # one look before each of the twelve steps, and one after them
+    assert new.least_s == pytest.approx(steps_s)  # an anchor's seeding is no keyframe's
+    new.insert(FRAME, se3.identity())
+    assert new.least_s == pytest.approx(0.02 + steps_s)  # four looks around seeding and pruning
 
 
 @pytest.mark.parametrize("name", ["least_iterations", "closing_iterations"])
