@@ -15,7 +15,7 @@ import signal
 import time
 from dataclasses import dataclass, field
 
-from magic_agent.client import MagicClient
+from magic_agent.client import ClientConfig, MagicClient
 from magic_cli import processes
 from magic_cli.agent import AgentCommand
 from magic_cli.collect import collect, collect_map, write_ground_truth
@@ -29,6 +29,8 @@ from magic_core.evaluation import RunFolder
 
 SESSION = "run"
 SERVER_START_TIMEOUT_S = 120.0
+RPC_TIMEOUT_S = 120.0
+"""Our own server on this machine may be slow when the machine is busy, but it is not away."""
 VIEWER_START_TIMEOUT_S = 60.0
 VIEWER_STOP_TIMEOUT_S = 60.0
 
@@ -142,7 +144,7 @@ class LocalRun:
 
     async def _finish(self, target: str, progress: RunProgress) -> None:
         write_ground_truth(self._folder, self._sources)
-        async with MagicClient(target) as client:
+        async with MagicClient(target, ClientConfig(rpc_timeout_s=RPC_TIMEOUT_S)) as client:
             if not await client.list_sessions() or not await client.list_submaps(SESSION):
                 logs = self._folder.agents_folder
                 raise DataError(f"no sub-map reached the server; see the agents' logs in {logs}")

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from magic_cli.viewer.colours import colour_of, loop_colour
+from magic_cli.viewer.colours import colour_of, loop_colour, on_surface
 from magic_cli.viewer.model import Pose, SessionView
 from magic_core.wire.records import LoopCandidate
 
@@ -73,7 +73,8 @@ class Lines:
     def _draw_loops(
         self, layer: LineLayer, loops: list[LoopCandidate], anchors: dict[str, Pose]
     ) -> None:
-        colours = np.array([loop_colour(c) for c in loops], np.uint8).reshape(-1, 3)
+        shown = [on_surface(loop_colour(c)) for c in loops]
+        colours = np.array(shown, np.uint8).reshape(-1, 3)
         points = np.array([_ends(c, anchors) for c in loops], np.float32).reshape(-1, 2, 3)
         if self._is_new((layer, "lines"), points, colours):
             self._draw_lines((layer, "lines"), points, np.repeat(colours[:, None], 2, axis=1))

@@ -38,12 +38,20 @@ def agents_text(view: SessionView, *, now: datetime | None = None) -> str:
     now = now or datetime.now(UTC)
     rows = [
         f"| {names.parse_agent(agent.name)[1]} | {agent.state.lower()} | "
-        f"{max(0, round((now - agent.last_seen_at).total_seconds()))} s ago | "
+        f"{_ago((now - agent.last_seen_at).total_seconds())} | "
         f"{agent.submap_count} | {_frames(view, agent.name)} | {_map_of(view, agent.name)} |"
-        for agent in view.agents
+        for agent in sorted(view.agents, key=lambda agent: agent.name)
     ]
     head = ["| agent | state | heard of | sub-maps | frames | map |", "|---|---|---|---|---|---|"]
     return "\n".join([*head, *rows])
+
+
+def _ago(seconds: float) -> str:
+    """A time past, in the largest unit that is not nought."""
+    for size, unit in ((86_400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit} ago"
+    return f"{max(0.0, seconds):.0f} s ago"
 
 
 def _frames(view: SessionView, agent: str) -> int:

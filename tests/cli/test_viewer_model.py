@@ -78,6 +78,8 @@ def test_texts_name_verdict_reason_and_figures():
     view.agents = (
         AgentInfo("sessions/room/agents/agent_0", "ACTIVE", now, now - timedelta(seconds=7), 2, 2),
     )
+    later = agents_text(view, now=now + timedelta(hours=2))
+    assert "| agent_0 | active | 2 h ago | 2 | 8 | joined |" in later
     assert "revision 3" in summary_text(view, 500)
     assert "1 rejected" in summary_text(view, 500)
     assert "| agent_0 | active | 7 s ago | 2 |" in agents_text(view, now=now)

@@ -33,7 +33,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (apt-get install chromium)"),
     pytest.mark.slow,
 ]
-FLAT = SyntheticConfig(agents=3, frames=60, width=200, height=150)
+FLAT = SyntheticConfig(agents=3, frames=45, width=160, height=120)
 MAP_AREA = (0, 0, 1000, 900)
 HAS_RERUN = importlib.util.find_spec("rerun") is not None
 
@@ -47,8 +47,8 @@ def running(tmp_path_factory):
     recording = ["--rerun", str(folder / "run.rrd")] if HAS_RERUN else []
     process = children.start(
         "run", "run", str(data), "--out", str(folder / "out"), "--json", "--viewer", *recording,
-        "--submap.frames", "15", "--submap.min-frames", "10", "--merge.iterations", "200",
-        "--candidates.min-similarity", "0.3", "--no-report",
+        "--submap.frames", "15", "--submap.min-frames", "10", "--merge.iterations", "60",
+        "--candidates.min-similarity", "0.3", "--candidates.top-k", "3", "--no-report",
     )  # fmt: skip
     address = re.compile(r"Open (http://\S+) in a browser")
     try:
