@@ -33,7 +33,8 @@ class HealthPort:
 
     def __init__(self, config: HealthPortConfig, servicer: health_pb2_grpc.HealthServicer) -> None:
         self._config = config
-        self._grpc = grpc.aio.server(maximum_concurrent_rpcs=64)
+        # Without the option two servers would share the port, and a probe ask either.
+        self._grpc = grpc.aio.server(maximum_concurrent_rpcs=64, options=[("grpc.so_reuseport", 0)])
         health_pb2_grpc.add_HealthServicer_to_server(servicer, self._grpc)
         self.port = 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -26,10 +27,16 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from magic_agent.client import ClientConfig, MagicClient
 from magic_core.errors import PermissionDenied, Unauthenticated, Unavailable
 from magic_core.wire import ClientCredentials
+from magic_server.config import ServerConfig
+from magic_server.health_port import HealthPortConfig
+from magic_server.server import Server
 from tests.small_world import DIMENSION, MODEL_ID
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 SYSTEMD = DEPLOY / "systemd"
+PATIENCE_S = 240.0
+"""For a machine that is busy with other things; nothing waits so long otherwise."""
+SERVING = health_pb2.HealthCheckResponse.SERVING
 TOKEN = "a-token-of-a-robot-0123456789"
 
 
@@ -132,7 +139,7 @@ class Deployed:
 
     async def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(PATIENCE_S):
             return await self.process.wait()
 
 
@@ -169,7 +176,7 @@ async def deployed(config: Path, folder: Path, keys: Path, **tls: Path) -> Async
     )  # fmt: skip
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE_S):
             ready = json.loads(await process.stdout.readline())
         yield Deployed(process, ready)
     finally:
@@ -192,9 +199,11 @@ def credentials(keys: Path, *, folder: Path | None = None, name: str | None = No
 
 
 async def register(
-    address: str, who: ClientCredentials, agent: str, *, patience_s: float = 20.0
+    address: str, who: ClientCredentials, agent: str, *, patience_s: float = 60.0
 ) -> None:
-    config = ClientConfig(attempts=1, connect_timeout_s=patience_s, credentials=who)
+    config = ClientConfig(
+        attempts=1, connect_timeout_s=patience_s, rpc_timeout_s=60.0, credentials=who
+    )
     async with MagicClient(address, config) as client:
         await client.register_agent("office", agent, model_id=MODEL_ID, dimension=DIMENSION)
 
@@ -207,13 +216,29 @@ async def health(address: str, service: str) -> int:
         return (await stub.Check(asked, timeout=20)).status
 
 
+async def test_a_second_server_does_not_share_the_health_port(
+    server_config: ServerConfig, tmp_path: Path
+) -> None:
+    config = dataclasses.replace(server_config, health=HealthPortConfig(port=0))
+    async with Server(config) as first:
+        assert await health(str(first.health_address), "") == SERVING
+        port = int(str(first.health_address).rpartition(":")[2])
+        taken = dataclasses.replace(
+            config, data_dir=tmp_path / "other", health=HealthPortConfig(port=port)
+        )
+        with pytest.raises(Unavailable, match=r"health\.port"):
+            async with Server(taken):
+                pass
+        assert await health(str(first.health_address), "readiness") == SERVING
+
+
 async def test_the_unit_starts_a_server_that_systemd_is_told_of(
     certificates: Path, tmp_path: Path
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         async with deployed(DEPLOY / "server.yaml", tmp_path, certificates) as server:
-            manager.settimeout(20)
+            manager.settimeout(PATIENCE_S)
             told = (await asyncio.to_thread(manager.recv, 4096)).decode()
             assert told.splitlines()[0] == "READY=1"
             assert server.ready["target"] in told
@@ -230,7 +255,7 @@ async def test_the_unit_starts_a_server_that_systemd_is_told_of(
             command = shlex.split(reload.replace("$MAINPID", str(server.process.pid)))
             (tmp_path / "tokens").write_text(f"robot_1 agent:sessions/office {TOKEN}\n")
             assert await (await asyncio.create_subprocess_exec(*command)).wait() == 0
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(PATIENCE_S):
                 while True:
                     with contextlib.suppress(PermissionDenied):
                         who = credentials(certificates, folder=tmp_path)
@@ -252,9 +277,8 @@ async def test_the_config_of_kubernetes_starts_a_server_with_mutual_tls_that_pro
         with pytest.raises(Unavailable):
             await register(address, no_certificate, "robot_1", patience_s=1.0)
 
-        serving = health_pb2.HealthCheckResponse.SERVING
         for service in ("liveness", "readiness", "magicslam.v1.MappingService"):
-            assert await health(server.ready["health"], service) == serving
+            assert await health(server.ready["health"], service) == SERVING
         with pytest.raises(grpc.aio.AioRpcError, match="UNIMPLEMENTED"):
             async with grpc.aio.insecure_channel(server.ready["health"]) as channel:
                 await channel.unary_unary("/magicslam.v1.SessionService/ListSessions")(b"")
