@@ -42,7 +42,7 @@ class MergeConfig:
     """Weight of the scale regularisation."""
     means_rate_m: float = 2e-3
     """Adam step of the means in metres at the start; all steps shrink to `final_rate`."""
-    final_rate: float = 0.05
+    final_rate: float = 0.1
     """Share of the learning rates that is left when the budget is spent."""
     exposure: bool = False
     """Fit a gain and an offset per keyframe and channel, and undo them in what the map learns:

@@ -9,7 +9,7 @@ other keyframe saw through the place where it would stand.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,46 +23,76 @@ from magic_core.render import RenderedView
 from magic_core.render.backend import Optimiser
 from magic_server.globalmap.placement import View
 
-_NOISE_SHARE = 0.03
+Mask = NDArray[np.bool_]
+
+_DEPTH_ERROR_SHARE = 0.1  # of the depth: less than that is what optimising is for
 _SEEN_THROUGH_SHARE = 0.05
 _MAX_EXTRAPOLATION = 2.0
+_WORTH_FILLING = 0.002  # of a view's pixels: fewer are left as they are
 
 
-def fill_measured(
-    optimiser: Optimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
+@dataclass(frozen=True, slots=True)
+class FillRule:
+    """What is filled."""
+
+    measured: bool
+    """Surface with a depth reading."""
+    unmeasured: bool
+    """Surface of which only the colour is known."""
+    alpha_threshold: float
+    """Rendered alpha below which a pixel counts as not shown."""
+    limit: int
+    """Most Gaussians of the map."""
+
+    def needs(self, view: View, rendered: RenderedView) -> tuple[Mask, Mask]:
+        """The pixels (h, w) to fill with measured, and with continued surface."""
+        measured = unmeasured = np.zeros(view.depth.shape, dtype=bool)
+        if self.measured:
+            measured = pixels_in_need(
+                rendered.alpha,
+                rendered.expected_depth,
+                view.depth,
+                alpha_threshold=self.alpha_threshold,
+                depth_error_factor=40.0,
+                depth_floor=_DEPTH_ERROR_SHARE,
+            )
+            measured = _without_specks(measured)
+        if self.unmeasured and (view.depth > 0).any():
+            unmeasured = (view.depth <= 0) & (rendered.alpha < self.alpha_threshold)
+        return measured, unmeasured
+
+    def lacks(self, view: View, rendered: RenderedView) -> int:
+        """How many pixels of a view are to be filled."""
+        return sum(int(np.count_nonzero(mask)) for mask in self.needs(view, rendered))
+
+
+def _without_specks(mask: Mask) -> Mask:
+    """The mask without what is narrower than three pixels: optimising closes that by itself."""
+    square = np.ones((3, 3), np.uint8)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, square).astype(bool)
+
+
+def fill_holes(
+    optimiser: Optimiser, views: Sequence[View], lacking: NDArray[np.int64], *, rule: FillRule
 ) -> int:
-    """Seed where a view measured surface that the map does not show; returns how many."""
-    before = len(optimiser)
-    for view in views:
-        rendered = optimiser.render(view.camera, view.world_from_camera)
-        need = pixels_in_need(
-            rendered.alpha,
-            rendered.expected_depth,
-            view.depth,
-            alpha_threshold=alpha_threshold,
-            depth_error_factor=40.0,
-            depth_floor=_NOISE_SHARE,
-        )
-        _extend(optimiser, view, need, surface_of(view.depth, view.camera), limit=limit)
-    return len(optimiser) - before
+    """Seed where views see what the map does not show; returns how many.
 
-
-def fill_unmeasured(
-    optimiser: Optimiser, views: Sequence[View], *, alpha_threshold: float, limit: int
-) -> int:
-    """Seed where only colour was seen and the map is transparent; returns how many."""
+    `lacking` (v,) says how many pixels of each view that is; views with hardly any are left out.
+    """
     before = len(optimiser)
-    for index, view in enumerate(views):
-        if not (view.depth > 0).any():
-            continue
+    least = [_WORTH_FILLING * view.depth.size for view in views]
+    for index in np.flatnonzero(lacking > least):
+        view = views[index]
         rendered = optimiser.render(view.camera, view.world_from_camera)
-        need = (view.depth <= 0) & (rendered.alpha < alpha_threshold)
-        if not need.any():
-            continue
-        completed = replace(view, depth=completed_depth(view, rendered))
-        surface = surface_of(completed.depth, view.camera)
-        others = [other for i, other in enumerate(views) if i != index]
-        _extend(optimiser, completed, need, surface, limit=limit, veto=others)
+        measured, unmeasured = rule.needs(view, rendered)
+        if measured.any():
+            surface = surface_of(view.depth, view.camera)
+            _extend(optimiser, view, measured, surface, limit=rule.limit)
+        if unmeasured.sum() > least[index]:
+            completed = replace(view, depth=completed_depth(view, rendered))
+            surface = surface_of(completed.depth, view.camera)
+            others = [other for i, other in enumerate(views) if i != index]
+            _extend(optimiser, completed, unmeasured, surface, limit=rule.limit, veto=others)
     return len(optimiser) - before
 
 

@@ -19,9 +19,9 @@ from magic_core.gaussians import GaussianCloud
 from magic_core.render import LearningRates, Rasteriser
 from magic_core.render.backend import Optimiser
 from magic_server.globalmap.config import MergeConfig
-from magic_server.globalmap.contribution import best_contribution
+from magic_server.globalmap.contribution import Survey, survey
 from magic_server.globalmap.exposure import ExposureModel
-from magic_server.globalmap.fill import fill_measured, fill_unmeasured
+from magic_server.globalmap.fill import FillRule, fill_holes
 from magic_server.globalmap.placement import View
 from magic_server.globalmap.sampling import VisitOrder, region_weights
 
@@ -31,11 +31,11 @@ Checkpoint = Callable[[GaussianCloud, int], None]
 _MIN_STEPS_PER_PASS = 60
 _SETTLED_PASSES = 2  # so many passes in a row must gain little
 _CHECKPOINT_S = 20.0
-_AGAIN_AT = 0.5  # share of the budget after which duplicates go once more
+_AGAIN_AT = 0.15  # share of the budget after which duplicates go once more
 _PREPARED = 0.1  # share of the progress that preparing takes
 # Several times those of 3DGS, which are made for tens of thousands of steps: here there are few,
-# each on a whole image of a map that is nearly right, and the rates fall.
-_START = LearningRates(quaternions=8e-3, scales=2e-2, opacities=5e-2, colours=2e-2)
+# each on a whole image of a map that is nearly right.
+_START = LearningRates(quaternions=1.2e-2, scales=3e-2, opacities=5e-2, colours=2e-2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class FineStage:
         """Prune, fill and optimise until the losses settle or the budget is spent."""
         pruned = filled = 0
         if not self._done:
-            pruned, filled = self._prune_unseen(0.01), self._fill()
+            pruned, filled = self._prepare()
         settled, saved = 0, time.monotonic()
         once_more = self._done < _AGAIN_AT * self._budget
         while self._done < self._budget and settled < _SETTLED_PASSES:
@@ -124,35 +124,45 @@ class FineStage:
             colour = self._exposure.undone(index, colour)
         return self._optimiser.step(view.camera, view.world_from_camera, colour, view.depth).loss
 
-    def _fill(self) -> int:
-        limits = {
-            "alpha_threshold": self._config.alpha_threshold,
-            "limit": self._config.max_gaussians,
-        }
-        filled = 0
-        if self._config.fill:
-            self._progress(0.03, "filling holes")
-            filled += fill_measured(self._optimiser, self._views, **limits)
-        if self._config.fill_unmeasured:
-            self._progress(0.06, "filling what has no depth")
-            filled += fill_unmeasured(self._optimiser, self._views, **limits)
-        return filled
+    def _prepare(self) -> tuple[int, int]:
+        """Remove what no keyframe shows, then fill what the keyframes lack; how many each.
+
+        Removing comes first, since all that follows takes time in proportion to the Gaussians.
+        """
+        rule = FillRule(
+            measured=self._config.fill,
+            unmeasured=self._config.fill_unmeasured,
+            alpha_threshold=self._config.alpha_threshold,
+            limit=self._config.max_gaussians,
+        )
+        found = self._survey(0.01, rule)
+        pruned = self._keep(self._shown(found))
+        self._progress(0.06, "filling holes")
+        return pruned, fill_holes(self._optimiser, self._views, found.lacking, rule=rule)
+
+    def _survey(self, share: float, rule: FillRule | None = None) -> Survey:
+        self._progress(share, "looking for what no keyframe shows")
+        return survey(
+            self._optimiser.gaussians(),
+            self._views,
+            rasteriser=Rasteriser(self._config.threads or None),
+            lacks=None if rule is None else rule.lacks,
+        )
 
     def _prune_faded(self) -> int:
         return self._keep(self._optimiser.gaussians().opacities >= self._config.prune_opacity)
 
     def _prune_unseen(self, share: float) -> int:
-        """Remove what no keyframe shows: duplicates of overlapping sub-maps, hidden leftovers.
-
-        Before everything else, since all that follows takes time in proportion to the Gaussians,
-        and once more when layers of equal rank have sorted out which of them shows.
-        """
+        """Remove once more what no keyframe shows, after layers of equal rank have sorted out
+        which of them does."""
         if self._config.min_contribution <= 0.0:
             return 0
-        self._progress(share, "removing what no keyframe shows")
-        rasteriser = Rasteriser(self._config.threads or None)
-        shown = best_contribution(self._optimiser.gaussians(), self._views, rasteriser=rasteriser)
-        return self._keep(shown > self._config.min_contribution)
+        return self._keep(self._shown(self._survey(share)))
+
+    def _shown(self, found: Survey) -> np.ndarray:
+        """(n,) which Gaussians show in any keyframe; all where none is to be removed."""
+        least = self._config.min_contribution
+        return found.best > least if least > 0.0 else np.ones(len(found.best), dtype=bool)
 
     def _keep(self, mask: np.ndarray) -> int:
         if not mask.all():
@@ -161,7 +171,7 @@ class FineStage:
 
 
 def rates(config: MergeConfig, progress: float) -> LearningRates:
-    """The learning rates after a share of the budget: they fall exponentially."""
-    share = config.final_rate**progress
+    """The learning rates after a share of the budget: they fall in a straight line."""
+    share = 1.0 + (config.final_rate - 1.0) * progress
     start = dataclasses.replace(_START, means=config.means_rate_m)
     return LearningRates(*(share * getattr(start, f.name) for f in dataclasses.fields(start)))

@@ -14,11 +14,13 @@ from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.seeding import BlockRule, SeedShape, seed_adaptive
 from magic_core.gaussians.surface import surface_of
 from magic_core.geometry import Camera, se3
-from magic_core.render import Rasteriser
+from magic_core.render import Rasteriser, RenderedView
 from magic_core.submap import Keyframe, Submap, TrackedFrame
 from magic_server.globalmap import GlobalMap, MergeConfig, PlacedSubmap, build_global_map
-from magic_server.globalmap.fill import completed_depth, seen_through
+from magic_server.globalmap.contribution import survey
+from magic_server.globalmap.fill import FillRule, completed_depth, seen_through
 from magic_server.globalmap.placement import View, coarse_merge, views_of
+from magic_server.globalmap.refine import rates
 from tests.small_world import look, render, thumbnail
 
 CAMERA = Camera(width=96, height=72, fx=84.0, fy=84.0, cx=47.5, cy=35.5)
@@ -161,6 +163,46 @@ def test_nothing_to_merge_is_refused():
 def test_values_out_of_range_are_named():
     with pytest.raises(ConfigError, match=r"merge\.alpha_threshold"):
         merge([submap(0, 0.0, 0.0)], replace(CONFIG, alpha_threshold=2.0))
+
+
+def test_learning_rates_fall_in_a_straight_line():
+    config = MergeConfig(means_rate_m=1e-3, final_rate=0.2)
+    assert [rates(config, t).means for t in (0.0, 0.5, 1.0)] == pytest.approx([1e-3, 6e-4, 2e-4])
+    assert rates(config, 1.0).colours == pytest.approx(0.2 * rates(config, 0.0).colours)
+
+
+RULE = FillRule(measured=True, unmeasured=True, alpha_threshold=0.8, limit=1000)
+
+
+def test_holes_are_filled_and_specks_are_left_to_optimising():
+    colour, depth = render(CAMERA, np.eye(4))
+    depth = np.full_like(depth, 2.0)
+    alpha = np.ones_like(depth)
+    alpha[10, 10] = alpha[20, 30] = 0.0  # specks
+    alpha[40:48, 50:60] = 0.0  # a hole
+    depth[60:64, 5:9], alpha[60:64, 5:9] = 0.0, 0.0  # seen in colour alone
+    image = np.stack([*colour.transpose(2, 0, 1) / 255.0, alpha * depth, alpha]).astype(np.float32)
+    shown = RenderedView(image, np.zeros(0, bool), np.zeros(0, np.float32), 0)
+    view = View(CAMERA, np.eye(4), colour, depth)
+    measured, unmeasured = RULE.needs(view, shown)
+    assert measured[40:48, 50:60].all()
+    assert measured.sum() == 80
+    assert unmeasured.sum() == 16
+    assert RULE.lacks(view, shown) == 96
+    assert replace(RULE, measured=False, unmeasured=False).lacks(view, shown) == 0
+
+
+def test_a_survey_finds_what_shows_and_which_keyframes_lack_anything():
+    whole, holed = submap(0, 0.0, 0.0), submap(0, 0.0, 0.0, hole=True)
+    behind = whole.submap.gaussians.transformed(se3.exp([0, 0, 0, 0, np.pi, 0]))
+    cloud = GaussianCloud.concatenate([whole.submap.gaussians, behind])
+    views = views_of([PlacedSubmap(whole.submap, np.eye(4))])
+    found = survey(cloud, views, rasteriser=Rasteriser(1), lacks=RULE.lacks)
+    count = len(whole.submap.gaussians)
+    assert (found.best[count:] == 0).all()
+    assert found.best[:count].sum() > 0.5 * CAMERA.width * CAMERA.height
+    half = survey(holed.submap.gaussians, views, rasteriser=Rasteriser(1), lacks=RULE.lacks)
+    assert half.lacking[0] > found.lacking[0] + 0.3 * CAMERA.width * CAMERA.height
 
 
 def test_completed_depth_continues_the_plane_of_the_nearest_reading():
