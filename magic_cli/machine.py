@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.metadata
 import importlib.util
 import os
 import platform
@@ -23,6 +24,7 @@ REQUIRED_LIBRARIES = (
     "numpy", "numba", "torch", "open3d", "gtsam", "faiss", "small_gicp", "kiss_matcher",
     "cv2", "onnxruntime", "grpc", "sqlalchemy", "rosbags", "lzfse",
 )  # fmt: skip
+_PAGE_PORT = 8080
 OLDEST_PYTHON = (3, 11)
 _LEAST_YEAR = 2025
 _CLOCK_STEP_S = 0.2
@@ -51,9 +53,11 @@ def all_checks(
         ("disk", functools.partial(disk, folder)),
         ("clock", clock),
         ("port", functools.partial(grpc_port, port)),
+        ("page port", functools.partial(page_port, _PAGE_PORT)),
         ("kernel cache", kernel_cache),
         ("ffmpeg", ffmpeg),
         ("camera", camera),
+        ("rerun", rerun),
         ("libraries", libraries),
         ("cuda", cuda),
         ("descriptor model", functools.partial(descriptor_model, places_model)),
@@ -159,15 +163,31 @@ def memory() -> Check:
 
 def grpc_port(port: int) -> Check:
     """Whether a server could listen there."""
+    reason = _taken(port)
+    if reason is not None:
+        remedy = "magic serve --port ANOTHER, or stop what listens there"
+        return Check("port", "warn", f"{port}: {reason}", remedy)
+    return Check("port", "ok", f"{port} is free")
+
+
+def page_port(port: int) -> Check:
+    """Whether the live view would be at its usual address."""
+    reason = _taken(port)
+    if reason is not None:
+        remedy = "the live view takes the next free one; --port or --viewer-port chooses"
+        return Check("page port", "warn", f"{port}: {reason}", remedy)
+    return Check("page port", "ok", f"{port} is free")
+
+
+def _taken(port: int) -> str | None:
+    """Why nothing more can listen at a port of this machine; None where it can."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("127.0.0.1", port))
         except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            remedy = "magic serve --port ANOTHER, or stop what listens there"
-            return Check("port", "warn", f"{port}: {reason}", remedy)
-    return Check("port", "ok", f"{port} is free")
+            return getattr(error, "strerror", None) or str(error)
+    return None
 
 
 def clock() -> Check:
@@ -208,6 +228,13 @@ def ffmpeg() -> Check:
     """Of use to cut and convert videos; our own are written without it."""
     path = shutil.which("ffmpeg")
     return Check("ffmpeg", "ok", path or "not on the PATH; nothing here needs it")
+
+
+def rerun() -> Check:
+    """The optional library that writes recordings."""
+    if importlib.util.find_spec("rerun") is None:
+        return Check("rerun", "ok", "no recordings (--rerun); pip install 'magic-slam[rerun]'")
+    return Check("rerun", "ok", f"rerun-sdk {importlib.metadata.version('rerun-sdk')}")
 
 
 def camera() -> Check:

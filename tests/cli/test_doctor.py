@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import socket
 import sys
 import time
+import types
 
+import llvmlite.binding as llvm
+import psutil
 import pytest
 
 from magic_cli import machine
 from magic_cli.main import run_command
 
-EXPECTED = {"python", "cpu", "memory", "disk", "clock", "port", "kernel cache", "ffmpeg", "camera",
-            "libraries", "cuda", "descriptor model"}  # fmt: skip
+EXPECTED = {"python", "cpu", "memory", "disk", "clock", "port", "page port", "kernel cache",
+            "ffmpeg", "camera", "rerun", "libraries", "cuda", "descriptor model"}  # fmt: skip
 
 
 def test_every_check_answers_on_this_machine(capsys, tmp_path):
@@ -44,9 +48,35 @@ def test_a_taken_port_is_a_warning():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         found = machine.grpc_port(taken.getsockname()[1])
+        page = machine.page_port(taken.getsockname()[1])
     assert found.status == "warn"
     assert "--port" in found.remedy
+    assert page.status == "warn"
+    assert "next free one" in page.remedy
     assert machine.grpc_port(700000).status == "warn"
+
+
+def test_little_memory_is_told(monkeypatch):
+    monkeypatch.setattr(
+        psutil, "virtual_memory", lambda: types.SimpleNamespace(available=2_000_000_000)
+    )
+    found = machine.memory()
+    assert found.status == "warn"
+    assert "--scale" in found.remedy
+
+
+def test_a_processor_without_vector_units_is_told(monkeypatch):
+    monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: {"sse2": True})
+    assert machine.cpu().status == "warn"
+    monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: {"avx2": True})
+    assert "8-lane" in machine.cpu().detail
+
+
+def test_what_is_optional_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    for check in (machine.rerun(), machine.camera()):
+        assert check.status == "ok"
+        assert "pip install" in check.detail
 
 
 @pytest.mark.parametrize(("free_gb", "status"), [(0.5, "fail"), (3, "warn"), (50, "ok")])
