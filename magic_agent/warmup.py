@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,21 +13,40 @@ from magic_agent.slam import Describe, LocalSlam
 from magic_agent.slam_config import SlamConfig
 from magic_core.data import Frame
 from magic_core.geometry import Camera
-from magic_core.render import warm_up
+from magic_core.render import WarmUpReport, warm_up
+from magic_core.submap import Descriptor
 
 _CAMERA = Camera(width=160, height=120, fx=140.0, fy=140.0, cx=79.5, cy=59.5)
 
 
-def warm_up_slam(config: SlamConfig, *, describe: Describe) -> None:
+def warm_up_slam(
+    config: SlamConfig | None = None,
+    *,
+    describe: Describe | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> WarmUpReport:
     """Take a throwaway engine through an anchor, a tracked frame and a lost one.
 
-    Compiles or loads the kernels of mapping, tracking and relocalisation, the libraries behind
-    them, and the descriptor model.
+    Compiles or loads the kernels of rendering, mapping, tracking and relocalisation, the libraries
+    behind them, and the descriptor model if `describe` asks one. progress: as for `warm_up`.
     """
-    warm_up()
-    slam = LocalSlam(_CAMERA, config, session="warm-up", agent="warm-up", describe=describe)
+    report = warm_up(progress=progress)
+    started = time.perf_counter()
+    slam = LocalSlam(
+        _CAMERA,
+        config or SlamConfig(),
+        session="warm-up",
+        agent="warm-up",
+        describe=describe or _no_descriptor,
+    )
     for frame in _frames():
         slam.process(frame)
+    seconds = {**report.seconds, "local SLAM": time.perf_counter() - started}
+    return replace(report, seconds=seconds)
+
+
+def _no_descriptor(colour: NDArray[np.uint8]) -> Descriptor:
+    return Descriptor("none", np.ones(1, np.float32))
 
 
 def _frames() -> list[Frame]:

@@ -58,11 +58,11 @@ def main(arguments: list[str]) -> int:
 
 
 def _warm_up() -> Check:
-    from magic_core.render import warm_up
+    from magic_agent.warmup import warm_up_slam
 
     start = time.perf_counter()
     with console.status("compiling or loading kernels") as status:
-        report = warm_up(progress=status.update)
+        report = warm_up_slam(progress=status.update)
     seconds = time.perf_counter() - start
     where = report.cache_folder or "nowhere: no folder can be written"
     return Check("kernels", "ok", f"compiled or loaded in {seconds:.0f} s, kept in {where}")

@@ -142,10 +142,10 @@ def _refuse_live(dataset: str) -> None:
 
 def compile_kernels() -> None:
     """Compile the kernels once, here, so that no agent's first frame waits for it unannounced."""
-    from magic_core.render import warm_up
+    from magic_agent.warmup import warm_up_slam
 
     with console.status("compiling or loading the kernels for this processor") as status:
-        report = warm_up(progress=status.update)
+        report = warm_up_slam(progress=status.update)
     if report.total_s > WORTH_SAYING_S:
         where = report.cache_folder or "memory: no cache folder can be written"
         console.print(f"Kernels compiled in {report.total_s:.0f} s, kept in {where}")
