@@ -6,8 +6,6 @@ sent once everything that followed from the one before is settled. Even then the
 one engine differ between two replays, by up to 1e-5 m: verdicts arrive in turns, and a pose that
 would move by less is not news (`NOTICEABLE_M`). What does not depend on the order is compared
 exactly: every verdict, and the whole graph as it stands in the end, solved by the engine once more.
-KISS-Matcher is not the same to the last bit where it has several cores, in the pool neither, which
-moves an accepted loop now and then by some 1e-5 m: `--methods visual` leaves it out.
 
 Examples:
   magic run DATASET --out runs/office

@@ -16,7 +16,6 @@ from magic_server.coordinator import SessionCoordinator
 from magic_server.globalmap import MergeConfig
 from magic_server.jobs import JobConfig
 from magic_server.posegraph.online import NOTICEABLE_M
-from magic_server.registration import RegistrationConfig
 from magic_server.server import Server
 from tests.cluster import Cluster, running_cluster
 from tests.end_to_end.conftest import Processes
@@ -80,11 +79,7 @@ def by_pool(recording, tmp_path_factory) -> dict[str, Any]:
 
 
 def config_of(folder: Path, jobs: JobConfig) -> ServerConfig:
-    # KISS-Matcher is not the same to the last bit where it has several cores.
-    registration = RegistrationConfig(methods=("visual",))
-    return ServerConfig(
-        data_dir=folder, listen=ListenConfig(port=0), jobs=jobs, registration=registration
-    )
+    return ServerConfig(data_dir=folder, listen=ListenConfig(port=0), jobs=jobs)
 
 
 def on(cluster: Cluster) -> JobConfig:
