@@ -64,13 +64,13 @@ def main(arguments: list[str]) -> int:
 
 def _verification(result: dict):
     bins = next(iter(result["verification"].values()))["recall_by_overlap"]
-    columns = ["method", "precision", *(f"recall {b}" for b in bins), "error", "time/pair"]
+    columns = ["method", "precision", *(f"recall {b}" for b in bins), "error", "median / p95 time"]
     rows = []
     for method, found in result["verification"].items():
         recall = [_share(found["recall_by_overlap"][b]["recall"]) for b in bins]
         error = found["median_error_m"]
         centimetres = "-" if error is None else f"{100 * error:.2f} cm"
-        times = f"{found['median_seconds']:.2f} s"
+        times = f"{found['median_seconds']:.3f} / {found['p95_seconds']:.2f} s"
         rows.append([method, _share(found["precision"]), *recall, centimetres, times])
     title = f"Verification: {result['anchors']} anchors, {len(result['pairs'])} registrations"
     return table(title, columns, rows)
