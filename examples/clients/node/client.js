@@ -141,7 +141,7 @@ async function map(client, session, path) {
   let written = 0;
   try {
     for await (const message of stream) {
-      if (message.payload === "header") {
+      if (message.header) {
         header = message.header;
         continue;
       }
