@@ -28,7 +28,7 @@ from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import verify_loop
 from magic_server.loops import LoopCandidate, SubmapKey, left_over, select_candidates
 from magic_server.metrics import Metrics
-from magic_server.places import DescriptorIndex
+from magic_server.places import LocalPlaces, Places
 from magic_server.poseboard import PoseBoard
 from magic_server.pruning import without
 from magic_server.solving import Solving
@@ -65,8 +65,7 @@ class SessionCoordinator:
         self._jobs = jobs
         self._threads = threads
         self._config = config
-        self._index = DescriptorIndex(session.dimension)
-        self._index_lock = asyncio.Lock()
+        self._places: Places = store.places(session) or LocalPlaces(session.dimension, threads)
         # Held while the store and what is kept here change together.
         self._editing = asyncio.Lock()
         self._solving = Solving(
@@ -93,10 +92,9 @@ class SessionCoordinator:
         vertices = await self._store.submaps.vertices(self.session)
         for vertex in vertices:
             self.graph.add_vertex(vertex)
-            if vertex.searched:
-                await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
-            else:
+            if not vertex.searched:
                 self._arrived.append(vertex)
+        await self._places.load([(v.name, v.descriptor.vector) for v in vertices if v.searched])
         for removed in await self._store.submaps.removed(self.session):
             self.graph.add_removed(removed)
         for loop in await self._store.loops.all(self.session):
@@ -155,8 +153,7 @@ class SessionCoordinator:
                 loop for loop in self._pending if removed.isdisjoint((loop.source, loop.target))
             )
             await self._solving.replace(message)
-            async with self._index_lock:
-                await self._in_thread(_forget, self._index, removed)
+            await self._places.remove(removed)
         self._notify()
         await self._tell_idle()
         return deleted
@@ -223,8 +220,7 @@ class SessionCoordinator:
         self, vector: np.ndarray, *, count: int, min_similarity: float
     ) -> list[records.LoopCandidate]:
         """The sub-maps most similar to a raw descriptor (d,), best first."""
-        async with self._index_lock:
-            hits = await self._in_thread(self._index.query, vector, count)
+        hits = await self._places.nearest(vector, count)
         return [
             records.LoopCandidate("", name, similarity, "SIMILAR", "NOT_VERIFIED")
             for name, similarity in hits
@@ -258,12 +254,9 @@ class SessionCoordinator:
         if vertex.name not in self.graph:
             return  # deleted meanwhile
         config = self._config.loops
-        async with self._index_lock:
-            hits = await self._in_thread(
-                self._index.query, vertex.descriptor.vector, config.top_k * QUERY_MARGIN
-            )
-            if vertex.name not in self._index:  # it is there when the disk was full before
-                await self._in_thread(self._index.add, vertex.name, vertex.descriptor.vector)
+        vector = vertex.descriptor.vector
+        hits = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
+        await self._places.add(vertex.name, vector)  # it is there when the disk was full before
         chosen = select_candidates(
             _key(vertex.name),
             [(_key(name), similarity) for name, similarity in hits],
@@ -295,9 +288,7 @@ class SessionCoordinator:
             query, keys, chosen, config, model_id=model_id, is_known_pair=self.graph.knows_pair
         ):
             vector = self.graph.descriptor_of(candidate.hit.name)
-            async with self._index_lock:
-                count = config.top_k * QUERY_MARGIN
-                around = await self._in_thread(self._index.query, vector, count)
+            around = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
             would = select_candidates(
                 candidate.hit,
                 [(_key(name), similarity) for name, similarity in around],
@@ -395,12 +386,6 @@ class SessionCoordinator:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
-
-
-def _forget(index: DescriptorIndex, names_: set[str]) -> None:
-    for name in names_:
-        if name in index:
-            index.remove(name)
 
 
 def _key(name: str) -> SubmapKey:

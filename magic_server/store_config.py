@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from magic_core.errors import ConfigError
 
@@ -23,6 +24,8 @@ class StoreConfig:
     """File whose first line is that address; used where `database` is empty."""
     database_env: str = "MAGIC_DATABASE"
     """Environment variable that holds it; used where neither of the others is set."""
+    index: Literal["faiss", "pgvector"] = "faiss"
+    """Where descriptors are searched: in this process, or by the database's pgvector."""
     connections: int = 8
     """Connections to PostgreSQL at most."""
     connect_timeout_s: float = 10.0

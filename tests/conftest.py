@@ -34,7 +34,8 @@ def new_store(request: pytest.FixtureRequest) -> NewStore:
     if request.param == "sqlite":
         return StoreConfig
     server: PostgresServer = request.getfixturevalue("postgresql")
-    return lambda: StoreConfig(database=server.database())
+    index = "pgvector" if server.has_pgvector else "faiss"
+    return lambda: StoreConfig(database=server.database(), index=index)
 
 
 @pytest.fixture

