@@ -85,6 +85,8 @@ class Figures:
     """Runs that took longer than their bound."""
     resent_needlessly: int = 0
     """Runs without a cut in which bytes were sent again."""
+    stopped_s: float = 0.0
+    """Time in which the machine did not run the campaign at all, counted as no link's fault."""
     kinds: dict[str, Kind] = field(default_factory=dict)
     seconds: float = 0.0
 
@@ -99,6 +101,8 @@ class Run:
     """One run's measurements."""
 
     seconds: float
+    """Without the time in which the machine did not run it."""
+    stopped_s: float
     bytes_up: int
     cuts: int
     silences: int
@@ -112,6 +116,35 @@ def lost_time_bound_s(run: Run) -> float:
     """
     pauses = run.cuts + run.refused
     return 2.0 + pauses * (RETRY_S + 0.5) + run.silences * (KEEPALIVE_S + KEEPALIVE_TIMEOUT_S + 1.0)
+
+
+class Standstill:
+    """Measures how long this process is not run: stopped, or kept from every processor.
+
+    A heartbeat comes late then, and next to no processor time has passed; an event loop that its
+    own code holds up uses some.
+    """
+
+    BEAT_S, LEAST_S, IDLE_SHARE = 0.1, 1.0, 0.05
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    async def __aenter__(self) -> Standstill:
+        self._task = asyncio.create_task(self._beat())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._task.cancel()
+
+    async def _beat(self) -> None:
+        while True:
+            began, used = time.monotonic(), time.process_time()
+            await asyncio.sleep(self.BEAT_S)
+            late_s = time.monotonic() - began - self.BEAT_S
+            worked_s = time.process_time() - used
+            if late_s > self.LEAST_S and worked_s < self.IDLE_SHARE * late_s:
+                self.seconds += late_s
 
 
 async def one_run(
@@ -133,14 +166,17 @@ async def one_run(
         address = await server.ready()
         async with Proxy(address, weather, rng) as proxy:
             begin = time.monotonic()
-            async with asyncio.TaskGroup() as group:
+            async with Standstill() as standstill, asyncio.TaskGroup() as group:
                 for submaps in recorded:
                     group.create_task(_upload(proxy.address, submaps, figures))
-            seconds = time.monotonic() - begin
+            seconds = time.monotonic() - begin - standstill.seconds
             traffic = proxy.traffic
         await _check(address, recorded, figures)
         await server.end()
-    return Run(seconds, traffic.bytes_up, traffic.cuts, traffic.silences, traffic.refused)
+    stopped_s = standstill.seconds
+    return Run(
+        seconds, stopped_s, traffic.bytes_up, traffic.cuts, traffic.silences, traffic.refused
+    )
 
 
 async def _upload(address: str, submaps: list[EncodedSubmap], figures: Figures) -> None:
@@ -219,6 +255,7 @@ async def campaign(
                 figures=figures,
             )
             seen[name].append(run)
+            figures.stopped_s = round(figures.stopped_s + run.stopped_s, 1)
             figures.runs += 1
             figures.over_bound += _lost_s(run, weathers[name], seen) > lost_time_bound_s(run)
             figures.resent_needlessly += not run.cuts and _resent(run, seen) > NEEDLESS
