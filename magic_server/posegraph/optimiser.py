@@ -118,7 +118,7 @@ def _square_root(information: Array) -> Array:
     """Upper triangular R (m, 6, 6) with R^T R the information."""
     if not len(information):
         return information
-    return np.linalg.cholesky(information).swapaxes(1, 2)
+    return np.linalg.cholesky(information).astype(np.float64).swapaxes(1, 2)
 
 
 def _gtsam_information(information: Array) -> Array:
