@@ -81,7 +81,7 @@ def fill_holes(
     """
     before = len(optimiser)
     least = [_WORTH_FILLING * view.depth.size for view in views]
-    for index in np.flatnonzero(lacking > least):
+    for index in np.flatnonzero(lacking > least).tolist():
         view = views[index]
         rendered = optimiser.render(view.camera, view.world_from_camera)
         measured, unmeasured = rule.needs(view, rendered)
