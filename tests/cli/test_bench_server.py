@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from magic_cli.benchmarks import server as bench
+from magic_cli.benchmarks import server_recording
 from magic_cli.benchmarks.server_recording import RecordedSubmap, Recording, replayed
 from magic_core.errors import ConfigError
 from magic_core.gaussians import codec
@@ -72,3 +73,15 @@ def test_a_short_load_is_stored_and_measured(capsys: pytest.CaptureFixture[str])
     assert all(times["p50"] <= times["p99"] for times in result["rpc_ms"].values())
     assert result["ratio"] == pytest.approx(result["mb_per_s"] / result["disk_mb_per_s"])
     assert result["loop_stalls_over_50ms"] >= 0
+
+
+@pytest.mark.slow
+def test_a_load_that_is_ended_early_keeps_its_figures(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(server_recording, "record", lambda progress: recording())
+    assert bench.main(["--agents", "4", "--submaps", "100000", "--seconds", "4", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert not result["complete"]
+    assert 0 < result["submaps"] < 100000
+    assert result["rpc_ms"]["SubmitSubmap"]["calls"] == result["submaps"]
