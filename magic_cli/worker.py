@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import platform
 import signal
@@ -121,6 +122,10 @@ async def _work(command: WorkerCommand) -> None:
     await serve_jobs(
         place, settings, stop=stop, on_ready=lambda address: _announce(command, name, address)
     )
+    # Dask's own tasks may not end where the scheduler vanished meanwhile; the jobs have ended.
+    sys.stdout.flush()
+    logging.shutdown()
+    os._exit(0)
 
 
 def _announce(command: WorkerCommand, name: str, address: str) -> None:

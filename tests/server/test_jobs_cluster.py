@@ -195,6 +195,21 @@ async def test_a_worker_that_is_told_to_stop_ends_its_job_and_leaves_in_peace(
 
 
 @pytest.mark.slow
+def test_a_worker_ends_when_told_to_whether_or_not_there_is_a_scheduler(tmp_path: Path) -> None:
+    with running_cluster(tmp_path / "cluster") as cluster:
+        for name in ("one", "two"):
+            cluster.start_worker(name)
+        one, two = (cluster.workers.pop(name) for name in ("one", "two"))
+        assert cluster.scheduler is not None
+        cluster.scheduler.terminate()
+        one.terminate()
+        assert one.wait(30.0) == 0
+        cluster.scheduler.wait(30.0)
+        two.terminate()
+        assert two.wait(30.0) == 0
+
+
+@pytest.mark.slow
 async def test_a_server_that_is_killed_leaves_no_job_running(tmp_path: Path) -> None:
     script = (
         "import asyncio, sys\n"

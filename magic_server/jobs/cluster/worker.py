@@ -62,8 +62,10 @@ async def serve_jobs(
             except (OSError, TimeoutError, ValueError) as error:
                 _complain(place, error)
             finally:
-                with contextlib.suppress(Exception):
-                    await asyncio.wait_for(worker.close(reason="magic worker"), CLOSE_TIMEOUT_S)
+                # Not wait_for: it would wait for Dask to give in where the scheduler vanished too.
+                closing = asyncio.ensure_future(worker.close(reason="magic worker"))
+                closing.add_done_callback(lambda task: task.cancelled() or task.exception())
+                await asyncio.wait([closing], timeout=CLOSE_TIMEOUT_S)
                 await slots.close()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), RECONNECT_S)
