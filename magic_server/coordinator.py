@@ -366,7 +366,7 @@ class SessionCoordinator:
         with logs.bound(**ids), tracing.span(doing, parent=parent, **ids, **attributes):
             yield
 
-    async def _wait_for_room(self, error: DiskFull) -> None:
+    async def _wait_for_room(self, error: DiskFull | Unavailable) -> None:
         logger.warning("%s: %s", self.session.name, error)
         await asyncio.sleep(ROOM_RETRY_S)
 

@@ -91,11 +91,12 @@ class SubmapTable:
         found: dict[tuple[int, int], FirstAnswer] = {}
         async with self._database.read() as connection:
             for table in (submaps, removed_submaps):
-                place = (table.c.agent_id, table.c.number)
+                agent, number = table.c.agent_id, table.c.number
                 columns = (table.c[field.name] for field in fields(FirstAnswer))
-                query = sa.select(*place, *columns).where(sa.tuple_(*place).in_(places))
+                mine = sa.tuple_(agent, number).in_(places)
+                query = sa.select(agent, number, *columns).where(mine)
                 for row in await connection.execute(query):
-                    found[row.agent_id, row.number] = FirstAnswer(*row[2:])
+                    found[row.agent_id, row.number] = FirstAnswer(*tuple(row)[2:])
         return found
 
     async def first_answer(self, agent: AgentRow, index: int) -> FirstAnswer | None:
