@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterable, AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Protocol
@@ -28,7 +28,9 @@ class Shelf(Protocol):
     async def show(self, session: str) -> Shown: ...
     async def delete(self, name: str, *, force: bool) -> records.Deletion: ...
     def export(self, session: str) -> AsyncIterator[bytes]: ...
-    async def import_(self, pieces: AsyncIterator[bytes]) -> records.SessionInfo: ...
+    async def import_(
+        self, pieces: AsyncIterable[bytes], *, request_id: str
+    ) -> records.SessionInfo: ...
 
 
 @asynccontextmanager
@@ -85,9 +87,11 @@ class ServerShelf:
         """A session's archive."""
         return self._client.export_session(session)
 
-    async def import_(self, pieces: AsyncIterator[bytes]) -> records.SessionInfo:
+    async def import_(
+        self, pieces: AsyncIterable[bytes], *, request_id: str
+    ) -> records.SessionInfo:
         """Store the session of an archive."""
-        return await self._client.import_session(pieces)
+        return await self._client.import_session(pieces, request_id=request_id)
 
 
 class FolderShelf:
@@ -138,9 +142,11 @@ class FolderShelf:
         """A session's archive."""
         return self._archives.export(session)
 
-    async def import_(self, pieces: AsyncIterator[bytes]) -> records.SessionInfo:
+    async def import_(
+        self, pieces: AsyncIterable[bytes], *, request_id: str
+    ) -> records.SessionInfo:
         """Store the session of an archive."""
-        return await self._info(await self._archives.import_(pieces))
+        return await self._archives.import_(pieces, request_id=request_id)
 
     async def _info(self, session: str) -> records.SessionInfo:
         (info,), _ = await self._store.agents.session_page(session=session)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+import uuid
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +28,7 @@ from magic_cli.output import console, print_json, table
 from magic_core.errors import ConfigError, NotFound
 from magic_core.wire import names, records
 from magic_core.wire.credentials import ClientCredentials
+from magic_core.wire.header_check import request_id_problem
 
 if TYPE_CHECKING:
     from magic_cli.session_shelf import Shelf
@@ -92,6 +94,9 @@ class ImportCommand(Place):
 
     archive: Positional[Path]
     """File that `magic sessions export` wrote."""
+    request_id: str = ""
+    """Name of this import: repeated with the same archive it gets the first answer. By default a
+    new one for each run, which it keeps while it tries again."""
 
 
 COMMANDS: dict[str, type[Place]] = {
@@ -140,8 +145,9 @@ async def _done(command: Place) -> dict[str, Any]:
                 size = await _write(shelf.export(session), path)
                 console.print(f"Written: {path}, {size / 1e6:.1f} MB", soft_wrap=True, markup=False)
                 return {"session": session, "archive": str(path), "bytes": size}
-            case ImportCommand(archive=archive):
-                info = await shelf.import_(_pieces(_existing(archive)))
+            case ImportCommand(archive=archive, request_id=request_id):
+                pieces = ArchiveFile(_existing(archive))
+                info = await shelf.import_(pieces, request_id=_chosen_or_new(request_id))
                 console.print(f"Imported {info.name}: {info.submap_count} sub-maps", markup=False)
                 return _session_json(info)
             case _:
@@ -213,6 +219,12 @@ def _session_json(info: records.SessionInfo) -> dict[str, Any]:
     }
 
 
+def _chosen_or_new(request_id: str) -> str:
+    if request_id and (problem := request_id_problem(request_id)):
+        raise ConfigError.field("request_id", problem)
+    return request_id or uuid.uuid4().hex
+
+
 def _place(path: Path, *, overwrite: bool) -> Path:
     """Where to write; ConfigError where a file is that may not be replaced."""
     if path.exists() and not overwrite:
@@ -244,7 +256,13 @@ def _existing(path: Path) -> Path:
     return path
 
 
-async def _pieces(path: Path) -> AsyncIterator[bytes]:
-    with path.open("rb") as file:
-        while piece := await asyncio.to_thread(file.read, PIECE_BYTES):
-            yield piece
+@dataclass(frozen=True, slots=True)
+class ArchiveFile:
+    """The pieces of an archive; it can be read any number of times."""
+
+    path: Path
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        with self.path.open("rb") as file:
+            while piece := await asyncio.to_thread(file.read, PIECE_BYTES):
+                yield piece

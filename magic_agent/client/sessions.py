@@ -142,30 +142,59 @@ class SessionCalls(Connection):
         finally:
             call.cancel()
 
-    async def import_session(self, pieces: AsyncIterable[bytes]) -> records.SessionInfo:
+    async def import_session(
+        self, pieces: AsyncIterable[bytes], *, request_id: str | None = None
+    ) -> records.SessionInfo:
         """Store the session of an archive; all of it or nothing.
 
-        Raises AlreadyExists when there is one of its name, CorruptData or InvalidInput for an
-        archive that breaks a rule. Not tried again: the pieces are gone.
+        While the server cannot be reached it is tried again under one request id, if `pieces` can
+        be read from the beginning again; what an iterator gave is gone. Raises AlreadyExists when
+        there is a session of its name, CorruptData or InvalidInput for an archive that breaks a
+        rule, and whatever reading `pieces` raises.
         """
-        call = self.session_stub.ImportSession(
-            _archive(pieces), timeout=self.config.download_timeout_s
-        )
-        try:
-            answer = await call
-        except grpc.RpcError as failure:
-            raise error_of(failure) from failure
+        request_id = request_id or new_id()
+
+        async def attempt() -> session_pb.ImportSessionResponse:
+            archive = _Archive(pieces, request_id)
+            timeout = self.config.download_timeout_s
+            try:
+                return await self.session_stub.ImportSession(archive.messages(), timeout=timeout)
+            except asyncio.CancelledError:
+                if archive.failure is not None:
+                    raise archive.failure from None
+                raise
+
+        if isinstance(pieces, AsyncIterator):
+            with self.own_errors():
+                answer = await attempt()
+        else:
+            answer = await self.retried(attempt)
         return convert.session_from_proto(answer.session)
 
 
-async def _archive(pieces: AsyncIterable[bytes]) -> AsyncIterator[session_pb.ImportSessionRequest]:
-    offset = 0
-    async for piece in pieces:
-        for chunk in chunks_of(piece):
-            length = len(chunk.data)
-            chunk.offset = offset
-            yield session_pb.ImportSessionRequest(chunk=chunk)
-            offset += length
+class _Archive:
+    """An archive on its way to a server."""
+
+    def __init__(self, pieces: AsyncIterable[bytes], request_id: str) -> None:
+        self.failure: Exception | None = None
+        """Why it could not be read; gRPC only says that the call was cancelled."""
+        self._pieces = pieces
+        self._request_id = request_id
+
+    async def messages(self) -> AsyncIterator[session_pb.ImportSessionRequest]:
+        """The archive in chunks; the first message has the request id."""
+        offset = 0
+        try:
+            async for piece in self._pieces:
+                for chunk in chunks_of(piece):
+                    length = len(chunk.data)
+                    chunk.offset = offset
+                    request_id = self._request_id if offset == 0 else ""
+                    yield session_pb.ImportSessionRequest(chunk=chunk, request_id=request_id)
+                    offset += length
+        except Exception as failure:
+            self.failure = failure
+            raise
 
 
 async def _collect(

@@ -23,6 +23,10 @@ class ArchiveReader:
     def __init__(self, folder: BlobFolder, *, max_bytes: int | None = None) -> None:
         self.archive = archive_pb2.SessionArchive()
         self.blobs: dict[str, BlobWriter] = {}
+        self.manifest_sha256 = b""
+        """Of the manifest, which holds the digests of all other files."""
+        self.knows_session = False
+        """Whether `archive` is read; what it says is not checked yet."""
         self._folder = folder
         self._max_bytes = max_bytes
         self._buffer = bytearray()
@@ -58,7 +62,9 @@ class ArchiveReader:
     def _read(self) -> Generator[int, bytes, None]:
         """The archive from front to end: yields how many bytes it wants next."""
         length = layout.announced_manifest((yield BLOCK))
-        members = layout.members_of((yield length))
+        manifest = yield length
+        self.manifest_sha256 = hashlib.sha256(manifest).digest()
+        members = layout.members_of(manifest)
         yield layout.padding(length)
         self._check_size(members)
         session, *blobs = members
@@ -86,6 +92,7 @@ class ArchiveReader:
             self.archive.ParseFromString(data)
         except DecodeError as error:
             raise CorruptData(f"{member.path} is not a SessionArchive message") from error
+        self.knows_session = True
 
     def _blob(self, member: Member) -> Generator[int, bytes, None]:
         blob = self.blobs[member.sha256] = self._folder.writer()

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine
+import time
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from concurrent.futures import Executor
-from typing import Any
+from typing import Any, TypeVar
 
 from magic_core.errors import CorruptData, ResourceExhausted
-from magic_core.wire import SubmapLimits, names
+from magic_core.wire import SubmapLimits, names, records
 from magic_core.wire.chunks import sha256
 from magic_server.archive import layout
 from magic_server.archive.checking import check_archive
 from magic_server.archive.layout import Member
 from magic_server.archive.reader import ArchiveReader
-from magic_server.store import Store, archive_of
+from magic_server.store import ImportedSubmap, ImportRequest, Store, archive_of
 
 PIECE_BYTES = 1 << 20
+_T = TypeVar("_T")
 
 
-async def _whole(work: Coroutine[Any, Any, None]) -> None:
+async def _whole(work: Coroutine[Any, Any, _T]) -> _T:
     """Run to the end: whoever is cancelled meanwhile waits for it first."""
     task = asyncio.ensure_future(work)
     try:
-        await asyncio.shield(task)
+        return await asyncio.shield(task)
     except asyncio.CancelledError:
         await asyncio.gather(task, return_exceptions=True)
         raise
@@ -65,25 +67,51 @@ class Archives:
             yield bytes(layout.padding(member.length))
         yield layout.END
 
-    async def import_(self, pieces: AsyncIterator[bytes], *, max_bytes: int | None = None) -> str:
-        """Store the session of an archive; returns its id.
+    async def import_(
+        self,
+        pieces: AsyncIterable[bytes],
+        *,
+        request_id: str,
+        max_bytes: int | None = None,
+        on_stored: Callable[[str], Awaitable[object]] | None = None,
+    ) -> records.SessionInfo:
+        """Store the session of an archive; a repeat of the request gets the first answer.
 
-        Raises AlreadyExists when there is one of its name, CorruptData or InvalidInput for an
-        archive that breaks a rule. Nothing is stored then.
+        `on_stored` is awaited with the session's id once it is durable, also when the caller is
+        gone by then. Raises AlreadyExists when there is a session of its name or the id was used
+        for another archive, CorruptData or InvalidInput for an archive that breaks a rule. Nothing
+        is stored then.
         """
         reader = ArchiveReader(self._store.blobs, max_bytes=max_bytes)
+        asked = None
         try:
             async for piece in pieces:
                 await self._in_thread(reader.feed, piece)
+                if asked is None and reader.knows_session:
+                    asked = _asked(reader, request_id)
+                    if (first := await self._store.archive.first_answer(asked)) is not None:
+                        return first.session
             reader.finish()
             submaps = await self._in_thread(
                 check_archive, reader.archive, reader.blobs, self._limits
             )
-            written = list(reader.blobs.values())
-            await _whole(self._store.add_session(reader.archive, submaps, written=written))
+            assert asked is not None  # `finish` passes only behind the session
+            return await _whole(self._add(reader, submaps, asked, on_stored))
         finally:
             await asyncio.shield(self._in_thread(reader.discard))
-        return names.parse_session(reader.archive.session.name)
+
+    async def _add(
+        self,
+        reader: ArchiveReader,
+        submaps: Sequence[ImportedSubmap],
+        asked: ImportRequest,
+        on_stored: Callable[[str], Awaitable[object]] | None,
+    ) -> records.SessionInfo:
+        written = list(reader.blobs.values())
+        added = await self._store.add_session(reader.archive, submaps, asked, written=written)
+        if on_stored is not None and not added.repeated:
+            await on_stored(names.parse_session(asked.name))
+        return added.session
 
     def _members(self, digests: list[str]) -> list[Member]:
         return [
@@ -104,3 +132,9 @@ class Archives:
 
     async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _asked(reader: ArchiveReader, request_id: str) -> ImportRequest:
+    name = reader.archive.session.name
+    names.parse_session(name, field="session.name")
+    return ImportRequest(name, request_id, reader.manifest_sha256, time.time())

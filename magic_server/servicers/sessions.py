@@ -184,16 +184,28 @@ class SessionServicer(session_grpc.SessionServiceServicer):
         request_iterator: AsyncIterator[session_pb.ImportSessionRequest],
         context: Context,
     ) -> session_pb.ImportSessionResponse:
-        session = await self._archives.import_(self._pieces(aiter(request_iterator)))
-        await self._sessions.named(session)  # what its loops still wait for begins
-        return session_pb.ImportSessionResponse(session=await self._session(session))
+        messages = aiter(request_iterator)
+        first = await next_message(messages, self._limits.upload_idle_s)
+        request_id = "" if first is None else first.request_id
+        check_request_id(request_id)
+        session = await self._archives.import_(
+            self._pieces(first, messages),
+            request_id=request_id,
+            on_stored=self._sessions.named,  # what its loops still wait for begins
+        )
+        return session_pb.ImportSessionResponse(session=convert.session_to_proto(session))
 
     async def _pieces(
-        self, messages: AsyncIterator[session_pb.ImportSessionRequest]
+        self,
+        message: session_pb.ImportSessionRequest | None,
+        messages: AsyncIterator[session_pb.ImportSessionRequest],
     ) -> AsyncIterator[bytes]:
-        """The bytes of an archive, in order, each piece as it was sent."""
+        """The bytes of an archive, in order, each piece as it was sent; `message` is the first."""
+        request_id = "" if message is None else message.request_id
         offset = 0
-        while (message := await next_message(messages, self._limits.upload_idle_s)) is not None:
+        while message is not None:
+            if message.request_id not in ("", request_id):
+                raise InvalidInput.field("request_id", "not that of the stream's first message")
             await self._in_thread(check_chunk, message.chunk)
             if (message.chunk.blob_index, message.chunk.offset) != (0, offset):
                 raise InvalidInput.field(
@@ -201,6 +213,7 @@ class SessionServicer(session_grpc.SessionServiceServicer):
                 )
             offset += len(message.chunk.data)
             yield message.chunk.data
+            message = await next_message(messages, self._limits.upload_idle_s)
 
     async def _session(self, session: str) -> session_pb.Session:
         found, _ = await self._store.agents.session_page(session=session)

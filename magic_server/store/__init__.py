@@ -5,6 +5,7 @@ from magic_server.store.answers import Asked
 from magic_server.store.archive import ImportedSubmap, archive_of
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
+from magic_server.store.imports import Imported, ImportRequest
 from magic_server.store.leases import LeaseTable
 from magic_server.store.maps import NewMap, OpenOperation
 from magic_server.store.rows import (
@@ -28,6 +29,8 @@ __all__ = [
     "Deleted",
     "DeletionRequest",
     "FirstAnswer",
+    "ImportRequest",
+    "Imported",
     "ImportedSubmap",
     "LeaseTable",
     "MapFile",

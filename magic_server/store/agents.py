@@ -123,20 +123,7 @@ class AgentTable:
         self, *, after: int = 0, limit: int = 100, session: str | None = None
     ) -> tuple[list[records.SessionInfo], int | None]:
         """Sessions behind row id `after`, or the one of a name, and where the next page begins."""
-        query = sa.select(
-            sessions,
-            _count(agents.c.session_id).label("agent_count"),
-            _count(submaps.c.session_id).label("submap_count"),
-            _sum_of_bytes(submaps.c.session_id == sessions.c.id).label("stored_bytes"),
-            sa.select(snapshots.c.revision)
-            .where(snapshots.c.session_id == sessions.c.id)
-            .scalar_subquery()
-            .label("revision"),
-            sa.select(sa.func.count())
-            .where(loops.c.session_id == sessions.c.id, loops.c.verdict == "PENDING")
-            .scalar_subquery()
-            .label("pending_loops"),
-        ).where(sessions.c.id > after)
+        query = _session_infos().where(sessions.c.id > after)
         if session is not None:
             query = query.where(sessions.c.name == session)
         rows, following = await self._page(query.order_by(sessions.c.id), limit)
@@ -184,6 +171,12 @@ class AgentTable:
             rows = (await connection.execute(query.limit(limit + 1))).all()
         following = rows[limit - 1].id if len(rows) > limit else None
         return rows[:limit], following
+
+
+async def session_info(connection: AsyncConnection, session: int) -> records.SessionInfo:
+    """A session by row id, as a transaction sees it."""
+    query = _session_infos().where(sessions.c.id == session)
+    return _session_info((await connection.execute(query)).one())
 
 
 def require_model(session: SessionRow, model_id: str, dimension: int) -> None:
@@ -247,6 +240,23 @@ def _new_id(result: sa.CursorResult) -> int:
     key = result.inserted_primary_key
     assert key is not None  # every table here has an integer primary key
     return int(key[0])
+
+
+def _session_infos() -> sa.Select:
+    return sa.select(
+        sessions,
+        _count(agents.c.session_id).label("agent_count"),
+        _count(submaps.c.session_id).label("submap_count"),
+        _sum_of_bytes(submaps.c.session_id == sessions.c.id).label("stored_bytes"),
+        sa.select(snapshots.c.revision)
+        .where(snapshots.c.session_id == sessions.c.id)
+        .scalar_subquery()
+        .label("revision"),
+        sa.select(sa.func.count())
+        .where(loops.c.session_id == sessions.c.id, loops.c.verdict == "PENDING")
+        .scalar_subquery()
+        .label("pending_loops"),
+    )
 
 
 def _session_info(row: sa.Row) -> records.SessionInfo:

@@ -13,7 +13,10 @@ from magic_core.errors import AlreadyExists, NotFound
 from magic_core.submap import OdometryEdge
 from magic_core.wire import convert, geometry, names, records
 from magic_server.snapshot_changes import merged_bytes
+from magic_server.store import imports
+from magic_server.store.agents import session_info
 from magic_server.store.database import Database
+from magic_server.store.imports import Imported, ImportRequest
 from magic_server.store.loops import loop_columns, loop_record
 from magic_server.store.rows import NewSubmap, SessionRow, pack, unpack
 from magic_server.store.schema import (
@@ -100,14 +103,27 @@ class ArchiveTable:
                 map_files=await _all(connection, files, map_files.c.map_id),
             )
 
+    async def first_answer(self, asked: ImportRequest) -> Imported | None:
+        """What this import was answered before; AlreadyExists for another archive's id."""
+        async with self._database.read() as connection:
+            return await imports.first_answer(connection, asked)
+
     async def insert(
-        self, archive: archive_pb2.SessionArchive, imported: Sequence[ImportedSubmap]
-    ) -> None:
-        """Store a checked archive; AlreadyExists when there is a session of its name."""
+        self,
+        archive: archive_pb2.SessionArchive,
+        imported: Sequence[ImportedSubmap],
+        asked: ImportRequest,
+    ) -> Imported:
+        """Store a checked archive, unless the same request did so meanwhile.
+
+        Raises AlreadyExists when there is a session of its name.
+        """
         info = convert.session_from_proto(archive.session)
         name = names.parse_session(info.name)
         async with self._database.write() as connection:
             await self._database.lock_name(connection, name)
+            if (first := await imports.first_answer(connection, asked)) is not None:
+                return first
             taken = sa.select(sessions.c.id).where(sessions.c.name == name)
             if await connection.scalar(taken) is not None:
                 raise AlreadyExists(f"{info.name} exists already; delete it before importing it")
@@ -120,6 +136,9 @@ class ArchiveTable:
             for one in imported:
                 await _insert_submap(connection, one, row, owners[one.agent])
             await _insert_rest(connection, archive, session_id, owners)
+            answer = await session_info(connection, session_id)
+            await imports.remember(connection, asked, answer)
+            return Imported(answer, repeated=False)
 
 
 def archive_of(rows: SessionRows) -> tuple[archive_pb2.SessionArchive, list[str]]:

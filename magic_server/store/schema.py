@@ -97,6 +97,18 @@ deletions = sa.Table(
     sa.Column("deleted_at", sa.Float, nullable=False),
 )
 
+# First answers of imports (imports.py). They outlive the session: a late repeat must not bring a
+# deleted one back.
+imports = sa.Table(
+    "imports",
+    metadata,
+    sa.Column("name", sa.String, primary_key=True),  # resource name of the session
+    sa.Column("request_id", sa.String(128), primary_key=True),
+    sa.Column("archive_sha256", sa.LargeBinary(32), nullable=False),  # of its manifest
+    sa.Column("answer", sa.LargeBinary, nullable=False),  # magicslam.v1.Session
+    sa.Column("imported_at", sa.Float, nullable=False),
+)
+
 # First answers of RegisterAgent and FinishAgent (answers.py).
 answers = sa.Table(
     "answers",

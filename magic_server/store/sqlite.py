@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import event
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.ext.asyncio import AsyncConnection, create_async_engine
 
-from magic_core.errors import DiskFull, MagicError
+from magic_core.errors import CorruptData, DiskFull, MagicError
 from magic_server.store.blobs import DISK_RETRY_S
 
 # A full disk shows as either, depending on which file had to grow.
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_SHMSIZE)
+
+_DAMAGED = (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT)
 
 
 class Sqlite:
@@ -38,11 +40,17 @@ class Sqlite:
         """Nothing to do: there is one writer at a time."""
 
     def error_of(self, error: Exception) -> MagicError | None:
-        """DiskFull when the disk has no room."""
+        """DiskFull when the disk has no room, CorruptData when the file is no whole database."""
         code = getattr(getattr(error, "orig", None), "sqlite_errorcode", None)
         if isinstance(error, OperationalError) and code in _NO_ROOM:
             message = "the server's disk is full; try again once there is room"
             return DiskFull(message, retry_after_s=DISK_RETRY_S)
+        # The low byte of a code says what is wrong, the others where it was noticed.
+        if isinstance(error, DatabaseError) and code is not None and code & 0xFF in _DAMAGED:
+            return CorruptData(
+                f"{self.place} is damaged or no database ({error.orig}); restore the data folder "
+                "from a backup, or choose another one"
+            )
         return None
 
 

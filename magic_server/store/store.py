@@ -31,6 +31,7 @@ from magic_server.store.database import Database
 from magic_server.store.deletions import Deletions
 from magic_server.store.descriptors import DescriptorTable, PgvectorPlaces
 from magic_server.store.engines import engine_of
+from magic_server.store.imports import Imported, ImportRequest
 from magic_server.store.leases import LeaseTable
 from magic_server.store.loops import LoopTable
 from magic_server.store.maps import MapTable, NewMap
@@ -180,18 +181,22 @@ class Store:
         self,
         archive: archive_pb2.SessionArchive,
         submaps: Sequence[ImportedSubmap],
+        asked: ImportRequest,
         *,
         written: Sequence[BlobWriter],
-    ) -> None:
+    ) -> Imported:
         """Make a checked archive durable: all of its session, or nothing."""
         loop = asyncio.get_running_loop()
         async with self._commit_lock:
             fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
             try:
-                await self.archive.insert(archive, submaps)
+                imported = await self.archive.insert(archive, submaps, asked)
             except BaseException:
                 await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
                 raise
+            if imported.repeated:  # they are those of a session that was deleted since
+                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+            return imported
 
     async def collect_orphans(self) -> int:
         """Remove blobs that no sub-map and no map refers to; returns how many."""

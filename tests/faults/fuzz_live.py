@@ -238,7 +238,9 @@ def _import(channel: grpc.aio.Channel, path: str, material: Material) -> Any:
         if rng.random() < 0.5:
             data = mutated_bytes(data, rng)
         request = session_service_pb2.ImportSessionRequest
-        messages = [request(chunk=c).SerializeToString() for c in chunks_of(data)]
+        requests = [request(chunk=chunk) for chunk in chunks_of(data)] or [request()]
+        requests[0].request_id = f"{rng.random()}"
+        messages = [one.SerializeToString() for one in requests]
         await channel.stream_unary(path)(_stream(messages), timeout=DEADLINE_S)
 
     return call

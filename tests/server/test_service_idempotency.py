@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from google.protobuf.descriptor import MethodDescriptor
+from magicslam.v1 import global_map_service_pb2, mapping_service_pb2, session_service_pb2
 
 from magic_agent.client import MagicClient
 from magic_core.errors import AlreadyExists, WrongState
 from magic_core.wire.records import AgentRegistration
+from magic_server.access import RULES
 from magic_server.config import ServerConfig
 from magic_server.server import Server
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
@@ -64,3 +67,23 @@ async def test_an_operation_repeated_is_the_first_one(server_config: ServerConfi
         with pytest.raises(AlreadyExists, match="another map"):
             await client.start_global_map("room", request_id="map", coarse_only=True)
         assert len(await client.list_operations("room")) == 1
+
+
+def _methods() -> dict[str, MethodDescriptor]:
+    files = (global_map_service_pb2, mapping_service_pb2, session_service_pb2)
+    services = [one for file in files for one in file.DESCRIPTOR.services_by_name.values()]
+    return {
+        f"/{service.full_name}/{method.name}": method
+        for service in services
+        for method in service.methods
+    }
+
+
+def test_every_call_that_changes_what_is_stored_carries_a_request_id() -> None:
+    methods = _methods()
+    changing = [method for path, method in methods.items() if RULES[path].mutates]
+    assert len(changing) >= 9
+    for method in changing:
+        fields = method.input_type.fields_by_name
+        carrier = fields["header"].message_type.fields_by_name if "header" in fields else fields
+        assert "request_id" in carrier, method.full_name

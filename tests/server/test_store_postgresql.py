@@ -13,7 +13,14 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sa
 
-from magic_core.errors import ConfigError, HeldElsewhere, NotFound, Unavailable, WrongState
+from magic_core.errors import (
+    ConfigError,
+    CorruptData,
+    HeldElsewhere,
+    NotFound,
+    Unavailable,
+    WrongState,
+)
 from magic_core.submap import Submap
 from magic_server.store import Asked, Store, migrations, schema
 from magic_server.store_config import StoreConfig
@@ -305,7 +312,7 @@ def differences(connection: sa.Connection) -> list:
 
 def before_the_revisions(connection: sa.Connection) -> None:
     """The tables as builds without revisions made them."""
-    new = {"leases", "identity"}
+    new = {"leases", "identity", "imports"}
     tables = [table for table in schema.metadata.sorted_tables if table.name not in new]
     schema.metadata.create_all(connection, tables=tables)
     connection.execute(sa.insert(schema.schema_version), {"version": 1})
@@ -341,14 +348,23 @@ async def test_a_new_database_has_every_table_and_a_later_one_is_refused(tmp_pat
             await Store(tmp_path, threads).open()
 
 
-async def test_an_existing_folder_opens_with_all_it_holds(tmp_path: Path) -> None:
+SINCE_REVISIONS = ("imports", "leases", "identity", "alembic_version")
+SINCE_FIRST_BUILDS = ("removed_submaps", "deletions", "answers", "snapshot_changes")
+
+
+@pytest.mark.parametrize("missing", [SINCE_REVISIONS, SINCE_REVISIONS + SINCE_FIRST_BUILDS])
+async def test_an_existing_folder_opens_with_all_it_holds(
+    missing: tuple[str, ...], tmp_path: Path
+) -> None:
     with ThreadPoolExecutor(2) as threads:
         async with Store(tmp_path, threads) as store:
             await registered(store)
             await add(store, make_submap(index=0))
         with closing(sqlite3.connect(tmp_path / "magic.sqlite")) as database:
-            for table in ("leases", "identity", "alembic_version"):
+            for table in missing:
                 database.execute(f"DROP TABLE {table}")
+            if "snapshot_changes" in missing:
+                database.execute("ALTER TABLE snapshots DROP COLUMN settled")
             database.commit()
         async with Store(tmp_path, threads) as store:
             await add(store, make_submap(index=1))
@@ -356,3 +372,56 @@ async def test_an_existing_folder_opens_with_all_it_holds(tmp_path: Path) -> Non
             assert len(await store.submaps.vertices(session)) == 2
             asked = Asked("again", bytes(32), 5.0)
             assert await store.agents.finish("room", "agent_0", asked=asked) == 2
+            async with store._database.write() as connection:
+                assert await connection.run_sync(differences) == []
+
+
+async def test_tables_that_a_first_build_left_incomplete_are_completed(tmp_path: Path) -> None:
+    """Revision 0002 was written down for databases that lacked tables of the first."""
+    with ThreadPoolExecutor(1) as threads:
+        async with Store(tmp_path, threads) as store:
+            await registered(store)
+        with closing(sqlite3.connect(tmp_path / "magic.sqlite")) as database:
+            for table in (*SINCE_FIRST_BUILDS, "imports"):
+                database.execute(f"DROP TABLE {table}")
+            database.execute("UPDATE alembic_version SET version_num = '0002'")
+            database.commit()
+        async with Store(tmp_path, threads) as store, store._database.write() as connection:
+            assert await connection.run_sync(differences) == []
+
+
+@pytest.mark.parametrize("version", ["0001", migrations.HEAD])
+async def test_a_database_that_lacks_what_no_build_left_out_is_refused_untouched(
+    version: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "magic.sqlite"
+    with ThreadPoolExecutor(1) as threads:
+        async with Store(tmp_path, threads):
+            pass
+        with closing(sqlite3.connect(file)) as database:
+            database.execute("DROP TABLE loops")
+            database.execute("ALTER TABLE agents DROP COLUMN finished")
+            if version == "0001":
+                for table in SINCE_REVISIONS:
+                    database.execute(f"DROP TABLE {table}")
+            database.commit()
+            before = list(database.iterdump())
+        with pytest.raises(WrongState, match=r"without column agents\.finished, table loops.*back"):
+            await Store(tmp_path, threads).open()
+        with closing(sqlite3.connect(file)) as database:
+            assert list(database.iterdump()) == before
+
+
+@pytest.mark.parametrize("content", [b"no database at all" * 500, None])
+async def test_a_damaged_database_is_named_with_what_helps(
+    content: bytes | None, tmp_path: Path
+) -> None:
+    file = tmp_path / "magic.sqlite"
+    with ThreadPoolExecutor(1) as threads:
+        async with Store(tmp_path, threads):
+            pass
+        whole = file.read_bytes()
+        # Past the header page, which says that it is a database.
+        file.write_bytes(content or whole[:4096] + b"\xff" * (len(whole) - 4096))
+        with pytest.raises(CorruptData, match=r"magic\.sqlite is damaged .*from a backup"):
+            await Store(tmp_path, threads).open()

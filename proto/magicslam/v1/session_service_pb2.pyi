@@ -788,6 +788,11 @@ class ImportSessionRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 
     CHUNK_FIELD_NUMBER: _builtins.int
+    REQUEST_ID_FIELD_NUMBER: _builtins.int
+    request_id: _builtins.str
+    """Chosen by the client, 1 to 128 printable characters; in the first message. The same again with the
+    same archive gets the first answer, for a month and even when the session was deleted since.
+    """
     @_builtins.property
     def chunk(self) -> _submap_pb2.BlobChunk:
         """In order; `blob_index` is 0."""
@@ -796,10 +801,11 @@ class ImportSessionRequest(_message.Message):
         self,
         *,
         chunk: _submap_pb2.BlobChunk | None = ...,
+        request_id: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["chunk", b"chunk"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["chunk", b"chunk"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["chunk", b"chunk", "request_id", b"request_id"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -814,7 +820,7 @@ class ImportSessionResponse(_message.Message):
     SESSION_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def session(self) -> Global___Session:
-        """It, as GetSession answers."""
+        """It, as GetSession answered when it had been stored."""
 
     def __init__(
         self,

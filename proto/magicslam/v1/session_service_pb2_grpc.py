@@ -188,7 +188,8 @@ class SessionServiceServicer:
 
     def ImportSession(self, request_iterator, context):
         """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
-        that an upload must keep is checked again.
+        that an upload must keep is checked again. Idempotent by `request_id`: a repeat may be answered
+        before all of it has come.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -51,7 +51,8 @@ class SessionServiceStub:
     """Streams a session as one archive (docs/wire-format.md), as it is at one instant."""
     ImportSession: _aio.StreamUnaryMultiCallable[_session_service_pb2.ImportSessionRequest, _session_service_pb2.ImportSessionResponse]
     """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
-    that an upload must keep is checked again.
+    that an upload must keep is checked again. Idempotent by `request_id`: a repeat may be answered
+    before all of it has come.
     """
 
 class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
@@ -163,7 +164,8 @@ class SessionServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _aio.ServicerContext[_abc.AsyncIterator[_session_service_pb2.ImportSessionRequest], _abc.Awaitable[_session_service_pb2.ImportSessionResponse]],
     ) -> _abc.Awaitable[_session_service_pb2.ImportSessionResponse]:
         """Takes an archive and stores its session, which must not exist yet, all of it or nothing. Every rule
-        that an upload must keep is checked again.
+        that an upload must keep is checked again. Idempotent by `request_id`: a repeat may be answered
+        before all of it has come.
         """
 
 def add_SessionServiceServicer_to_server(servicer: SessionServiceServicer, server: _aio.Server) -> None: ...
