@@ -25,7 +25,7 @@ PLACEHOLDER = re.compile(r"\b(COMMAND|NAME|WHAT)\b")
 WITH_SETTINGS = ("run", "serve", "agent", "view", "doctor", "check-data", "export", "render",
                  "worker")  # fmt: skip
 OF_OTHERS = {
-    "--gpus", "--profile", "--runs", "--insecure-tokens",
+    "--gpus", "--profile", "--runs", "--halts", "--insecure-tokens",
 }  # fmt: skip
 """Options of docker and of the fault campaigns that stand in prose."""
 

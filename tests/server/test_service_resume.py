@@ -13,6 +13,7 @@ import grpc.aio
 import pytest
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
+from magicslam.v1 import submap_pb2 as submap_pb
 
 from magic_agent.client import MagicClient
 from magic_core.errors import AlreadyExists, InvalidInput, MagicError, NotFound, Unavailable
@@ -77,6 +78,10 @@ def held_bytes(server: Server) -> int:
     return sum(file.stat().st_size for file in folder.glob("*/[0-9]*"))
 
 
+def ends_blob(submap: EncodedSubmap, chunk: submap_pb.BlobChunk) -> bool:
+    return chunk.offset + len(chunk.data) == len(submap.blobs[chunk.blob_index])
+
+
 def payload(sent: Requests) -> int:
     return sum(len(message.chunk.data) for message in sent)
 
@@ -99,6 +104,8 @@ async def test_a_broken_stream_goes_on_behind_the_last_byte_that_came(
 ) -> None:
     submap = encoded()
     sent = messages(submap)[:14]
+    while ends_blob(submap, sent[-1].chunk):
+        sent.pop()  # the position behind a whole blob is the start of the next
     await break_off(server, sent)
     position = await registered.resume_upload(NAME, "first")
     last = sent[-1].chunk
