@@ -61,7 +61,8 @@ def _found(connection: sa.Connection) -> str | None:
 
 def _missing(connection: sa.Connection) -> list[str]:
     """Tables and columns that this build needs and the database has not."""
-    tables = sa.inspect(connection).get_multi_columns()
+    ours = list(schema.metadata.tables)
+    tables = sa.inspect(connection).get_multi_columns(filter_names=ours)
     found = {
         table: {column["name"] for column in columns} for (_, table), columns in tables.items()
     }
