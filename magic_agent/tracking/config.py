@@ -30,7 +30,7 @@ class GaussNewtonConfig:
     """Most renders of the sub-map per frame."""
     rerender_pixels: float = 3.0
     """Render again where the solution lies farther than this from the pose of the last render."""
-    converged_pixels: float = 0.1
+    converged_pixels: float = 0.05
     """A level is done when a step moves the image by less than this, in pixels of that level; the
     next step would move it by far less."""
     photometric: bool = True
