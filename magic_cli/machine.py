@@ -163,20 +163,20 @@ def memory() -> Check:
 
 def grpc_port(port: int) -> Check:
     """Whether a server could listen there."""
-    reason = _taken(port)
-    if reason is not None:
-        remedy = "magic serve --port ANOTHER, or stop what listens there"
-        return Check("port", "warn", f"{port}: {reason}", remedy)
-    return Check("port", "ok", f"{port} is free")
+    return _port("port", port, "magic serve --port ANOTHER, or stop what listens there")
 
 
 def page_port(port: int) -> Check:
     """Whether the live view would be at its usual address."""
+    remedy = "the live view takes the next free one; --port or --viewer-port chooses"
+    return _port("page port", port, remedy)
+
+
+def _port(name: str, port: int, remedy: str) -> Check:
     reason = _taken(port)
     if reason is not None:
-        remedy = "the live view takes the next free one; --port or --viewer-port chooses"
-        return Check("page port", "warn", f"{port}: {reason}", remedy)
-    return Check("page port", "ok", f"{port} is free")
+        return Check(name, "warn", f"{port}: {reason}", remedy)
+    return Check(name, "ok", f"{port} is free")
 
 
 def _taken(port: int) -> str | None:

@@ -16,6 +16,7 @@ from magic_core import tracing
 from magic_core.errors import Unavailable
 from magic_core.tracing import TracingConfig
 from magic_server.jobs.config import JobConfig
+from magic_server.jobs.counted import CountedJobs
 from magic_server.jobs.protocol import JobObserver
 from magic_server.jobs.worker import JobDone, prepare_worker, run_job
 
@@ -23,7 +24,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class ProcessExecutor:
+class ProcessExecutor(CountedJobs):
     """Jobs in spawned processes on this machine; a job whose worker dies is tried once more."""
 
     def __init__(
@@ -33,10 +34,10 @@ class ProcessExecutor:
         trace: TracingConfig | None = None,
         observer: JobObserver = lambda job, outcome, waited_s, ran_s: None,
     ) -> None:
+        super().__init__()
         self._config = config or JobConfig()
         self._trace = trace or TracingConfig()
         self._observer = observer
-        self._open = 0
         self._pool = self._new_pool()
         self._lock = threading.Lock()
         self._closed = False
@@ -51,23 +52,8 @@ class ProcessExecutor:
         """How many jobs could run at once now."""
         return self._config.workers
 
-    @property
-    def waiting(self) -> int:
-        """Jobs that wait for a worker."""
-        return max(0, self._open - self._config.workers)
-
     async def start(self) -> None:
         """Nothing: processes start with the first jobs."""
-
-    async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
-        """The function's result, or the error it raised. Unavailable when the worker died twice."""
-        name = getattr(function, "__name__", str(function))
-        self._open += 1
-        try:
-            with tracing.span(f"job {name}"):
-                return await self._run(name, function, *arguments)
-        finally:
-            self._open -= 1
 
     async def _run(self, name: str, function: Callable[..., T], *arguments: Any) -> T:
         parent = tracing.traceparent()

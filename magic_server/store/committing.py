@@ -122,7 +122,7 @@ class SubmapCommits:
         return taken
 
     async def _commit(self, batch: list[_Waiting]) -> None:
-        known = await self._submaps.first_answers([one.arrival for one in batch])
+        known = await self._submaps.first_answers([one.place for one in batch])
         for one in batch:
             if one.place in known:
                 one.settle(known[one.place])

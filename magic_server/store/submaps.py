@@ -84,10 +84,9 @@ class SubmapTable:
                 await _insert(connection, arrival)
 
     async def first_answers(
-        self, arrivals: Sequence[Arrival]
+        self, places: Sequence[tuple[int, int]]
     ) -> dict[tuple[int, int], FirstAnswer]:
         """The first answers of those that are stored already, deleted or not, by their places."""
-        places = [arrival.place for arrival in arrivals]
         found: dict[tuple[int, int], FirstAnswer] = {}
         async with self._database.read() as connection:
             for table in (submaps, removed_submaps):
@@ -96,19 +95,13 @@ class SubmapTable:
                 mine = sa.tuple_(agent, number).in_(places)
                 query = sa.select(agent, number, *columns).where(mine)
                 for row in await connection.execute(query):
-                    found[row.agent_id, row.number] = FirstAnswer(*tuple(row)[2:])
+                    found.setdefault((row.agent_id, row.number), FirstAnswer(*tuple(row)[2:]))
         return found
 
     async def first_answer(self, agent: AgentRow, index: int) -> FirstAnswer | None:
         """The answer that a sub-map got when it was stored, deleted or not, or None."""
-        async with self._database.read() as connection:
-            for table in (submaps, removed_submaps):
-                columns = (table.c[field.name] for field in fields(FirstAnswer))
-                mine = sa.and_(table.c.agent_id == agent.id, table.c.number == index)
-                row = (await connection.execute(sa.select(*columns).where(mine))).one_or_none()
-                if row is not None:
-                    return FirstAnswer(*row)
-        return None
+        place = (agent.id, index)
+        return (await self.first_answers([place])).get(place)
 
     async def number_of_request(self, agent: AgentRow, request_id: str) -> int | None:
         """The index of the sub-map, deleted or not, that an agent's request stored, or None."""

@@ -206,8 +206,10 @@ class Dispatch:
             self._roster.clear()
             self._set_limits()
             self._give_up_flights()
-            with contextlib.suppress(Exception):
+            try:
                 await _closed(client)
+            except Exception:
+                logger.debug("a lost connection did not close cleanly", exc_info=True)
 
     async def _require_like_scheduler(self, client: Client) -> None:
         try:
@@ -294,7 +296,9 @@ async def _closed(client: Client) -> None:
 async def _let_go(client: Client, future: Future) -> None:
     """The scheduler may forget a job; a worker that still runs it ends it."""
     if client.status == "running":
-        with contextlib.suppress(Exception):
+        try:
             if not future.done():
                 await asyncio.shield(client.cancel([future], force=True))
             future.release()
+        except Exception:
+            logger.debug("the scheduler was not told to forget a job", exc_info=True)

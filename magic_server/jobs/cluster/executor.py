@@ -16,6 +16,7 @@ from magic_server.jobs.cluster.admission import mark
 from magic_server.jobs.cluster.dispatch import Dispatch
 from magic_server.jobs.cluster.library import require_distributed, security_of
 from magic_server.jobs.config import JobConfig
+from magic_server.jobs.counted import CountedJobs
 from magic_server.jobs.kinds import kind_of
 from magic_server.jobs.protocol import JobObserver
 from magic_server.jobs.sealing import JobFailed, SealedJob, seal, unseal
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class DaskExecutor:
+class DaskExecutor(CountedJobs):
     """Jobs wherever a `magic worker` is connected to the scheduler and sees the data folder."""
 
     def __init__(
@@ -36,12 +37,12 @@ class DaskExecutor:
         observer: JobObserver = lambda job, outcome, waited_s, ran_s: None,
     ) -> None:
         """Raises ConfigError without Dask or with certificates that cannot be used."""
+        super().__init__()
         require_distributed(field="jobs.executor")
         self._security = security_of(config.tls, field="jobs.tls")
         self._config = config
         self._folder = folder
         self._observer = observer
-        self._open = 0
         # Dask has a loop of its own: large messages and its bookkeeping hold up no call.
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run_loop, name="magic-dask", daemon=True)
@@ -58,11 +59,6 @@ class DaskExecutor:
         """How many jobs could run at once now."""
         return 0 if self._dispatch is None else self._dispatch.slots
 
-    @property
-    def waiting(self) -> int:
-        """Jobs that wait for a worker."""
-        return max(0, self._open - self.slots)
-
     async def start(self) -> None:
         """Begin to connect; a scheduler that is away is waited for, which the log says."""
         store = await asyncio.to_thread(mark, self._folder)
@@ -71,16 +67,6 @@ class DaskExecutor:
             self._config, folder=self._folder, store=store, security=self._security
         )
         self._keeping = self._over_there(self._dispatch.keep_connected())
-
-    async def run(self, function: Callable[..., T], /, *arguments: Any) -> T:
-        """The function's result, or the error it raised. Unavailable when workers died of it."""
-        name = getattr(function, "__name__", str(function))
-        self._open += 1
-        try:
-            with tracing.span(f"job {name}"):
-                return await self._run(name, function, *arguments)
-        finally:
-            self._open -= 1
 
     async def close(self) -> None:
         """Leave the cluster; its workers end what they run for this server."""
