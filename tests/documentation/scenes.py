@@ -102,22 +102,9 @@ def _callers(text: str, _: Path) -> None:
     parse_tokens(whole, source="the page")
 
 
-def _diagram(text: str, _: Path) -> None:
-    """Every node that an arrow leads to or from is declared, every group is closed."""
-    assert text.count("subgraph") == len(re.findall(r"^\s*end$", text, re.MULTILINE))
-    declared = set(re.findall(r"\b(\w+)[\[(]", text)) | set(re.findall(r"subgraph (\w+)", text))
-    for line in text.splitlines():
-        if "--" in line:
-            ends = re.sub(r"[\[(].*?[\])]+|--.*?-->", lambda m: " " if m[0][0] in "[(" else "|",
-                          line)  # fmt: skip
-            for name in re.findall(r"\w+", ends.replace("-->", "|")):
-                assert name in declared, f"{name}: an arrow, but no node"
-
-
 PARSED: dict[tuple[str, str], Callable[[str, Path], None]] = {
     ("docs/clients.md", "json"): _header,
     ("docs/own-data.md", "json"): _intrinsics,
     ("docs/security.md", "text"): _callers,
-    ("docs/architecture.md", "mermaid"): _diagram,
 }
 """Blocks that are data: read as what the page says they are."""

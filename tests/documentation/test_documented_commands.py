@@ -6,8 +6,10 @@ import ast
 import functools
 import re
 from collections.abc import Iterator
+from xml.etree import ElementTree
 
 import pytest
+from magicslam.v1 import global_map_service_pb2, mapping_service_pb2, session_service_pb2
 
 from tests.commands import options_of, parse_command
 from tests.documentation.pages import (
@@ -21,6 +23,13 @@ from tests.documentation.pages import (
 )
 from tests.documentation.scenes import ELSEWHERE, PARSED, RUN
 
+SVG = "{http://www.w3.org/2000/svg}"
+CALLS = {
+    method.name
+    for contract in (global_map_service_pb2, mapping_service_pb2, session_service_pb2)
+    for service in contract.DESCRIPTOR.services_by_name.values()
+    for method in service.methods
+}
 PLACEHOLDER = re.compile(r"\b(COMMAND|NAME|WHAT)\b")
 WITH_SETTINGS = ("run", "serve", "agent", "view", "doctor", "check-data", "export", "render",
                  "worker")  # fmt: skip
@@ -139,3 +148,19 @@ def test_links_lead_somewhere(page) -> None:
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
         if not target.startswith(("http://", "https://")):
             assert (page.parent / target).exists(), f"{name_of(page)}: {target}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs").rglob("*.svg")), ids=name_of)
+def test_a_diagram_needs_no_network_and_names_real_calls(path) -> None:
+    drawing = ElementTree.parse(path)
+    for element in drawing.iter():
+        for attribute, value in element.attrib.items():
+            assert "href" not in attribute, f"{name_of(path)}: {value} lies elsewhere"
+    called = [e.text for e in drawing.iter(f"{SVG}text") if e.get("class") == "call"]
+    assert called
+    assert set(called) <= CALLS
+
+
+def test_no_page_is_drawn_by_a_script_from_elsewhere() -> None:
+    for page in PAGES:
+        assert "mermaid" not in {block.language for block in blocks(page)}, name_of(page)
