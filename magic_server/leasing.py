@@ -176,4 +176,3 @@ class Leasing:
             if dropped is not None:
                 await self._maps.forget(dropped)
                 logger.warning("%s: its lease was lost", dropped.name)
-        self._locks.pop(session, None)

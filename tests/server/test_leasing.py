@@ -28,7 +28,8 @@ from tests.postgresql import PostgresServer
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 from tests.waiting import eventually
 
-LEASE_S = 1.0
+LEASE_S = 8.0
+"""No machine stands still for so long; a lost lease is noticed in a quarter of it."""
 CLIENT = ClientConfig(rpc_timeout_s=60.0)
 ONCE = dataclasses.replace(CLIENT, attempts=1)
 
@@ -61,20 +62,26 @@ async def register(client: MagicClient, session: str = "room", agent: str = "age
 
 
 async def fall_silent(server: Server) -> None:
-    """As a server that hangs: it renews no lease and looks for no session."""
+    """As a server that has hung for a while: its leases have ended, it looks for no session."""
     assert server._leasing is not None
     await server._leasing._renewing.close()
     await server._leasing._looking.close()
+    await end_leases(server)
+
+
+async def end_leases(server: Server) -> None:
+    """As if all leases had been taken long ago."""
+    async with server._store._database.write() as connection:
+        await connection.execute(sa.update(schema.leases).values(expires_at=1.0))
 
 
 async def take_over(server: Server) -> None:
     """As if the holder had not been heard of for a while: it goes on renewing, too late."""
     assert server._leasing is not None
     session = await server._store.agents.session("room")
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(60):
         while True:
-            async with server._store._database.write() as connection:
-                await connection.execute(sa.update(schema.leases).values(expires_at=1.0))
+            await end_leases(server)
             with contextlib.suppress(HeldElsewhere):  # it was just in time
                 return await server._leasing._take(session)
 
@@ -120,8 +127,7 @@ async def test_sessions_of_a_silent_server_move_and_it_cannot_write(
         await client.submit_encoded(encoded[0])
         session = (await a.sessions.named("room")).session
         await fall_silent(a)
-        async with asyncio.timeout(20 * LEASE_S):
-            await eventually(lambda: b.sessions.found("room") is not None)
+        await eventually(lambda: b.sessions.found("room") is not None)
         with pytest.raises(HeldElsewhere):
             async with a._store._database.write(session.id):
                 pass

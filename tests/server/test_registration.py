@@ -73,9 +73,10 @@ def test_the_two_directions_agree(room):
 @pytest.mark.parametrize("method", ["visual", "kiss"])
 def test_the_same_views_give_the_same_result(room, method):
     config = RegistrationConfig(methods=(method,))
-    results = [register(room.view(FIRST), room.view(SECOND), config) for _ in range(2)]
-    np.testing.assert_array_equal(results[0].target_from_source, results[1].target_from_source)
-    np.testing.assert_array_equal(results[0].information, results[1].information)
+    first, second = (register(room.view(FIRST), room.view(SECOND), config) for _ in range(2))
+    # Not to the last bit: where a matcher's sums run on several threads, their order may differ.
+    np.testing.assert_allclose(first.target_from_source, second.target_from_source, atol=1e-9)
+    np.testing.assert_allclose(first.information, second.information, rtol=1e-6, atol=1e-6)
 
 
 def test_same_shape_with_other_pictures_is_refused(room):

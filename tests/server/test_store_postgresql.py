@@ -44,7 +44,7 @@ async def opened(postgresql: PostgresServer, tmp_path: Path) -> AsyncIterator[Op
                 stack.push_async_exit(store)
                 await store.open()
                 assert store.leases is not None
-                store.leases.begin(address=f"{replica}:1", lease_s=2.0)
+                store.leases.begin(address=f"{replica}:1", lease_s=600.0)
                 return store
 
             yield one
