@@ -258,8 +258,8 @@ class SessionCoordinator:
         hits = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
         await self._places.add(vertex.name, vector)  # it is there when the disk was full before
         chosen = select_candidates(
-            _key(vertex.name),
-            [(_key(name), similarity) for name, similarity in hits],
+            self._key(vertex.name),
+            [(self._key(name), similarity) for name, similarity in hits],
             config,
             model_id=self.session.model_id,
             is_known_pair=self.graph.knows_pair,
@@ -281,8 +281,8 @@ class SessionCoordinator:
     ) -> list[LoopCandidate]:
         """Older sub-maps that would choose the new one, where it had no room for them."""
         config, model_id = self._config.loops, self.session.model_id
-        keys = [(_key(name), similarity) for name, similarity in hits]
-        query = _key(vertex.name)
+        keys = [(self._key(name), similarity) for name, similarity in hits]
+        query = self._key(vertex.name)
         found = []
         for candidate in left_over(
             query, keys, chosen, config, model_id=model_id, is_known_pair=self.graph.knows_pair
@@ -291,7 +291,7 @@ class SessionCoordinator:
             around = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
             would = select_candidates(
                 candidate.hit,
-                [(_key(name), similarity) for name, similarity in around],
+                [(self._key(name), similarity) for name, similarity in around],
                 config,
                 model_id=model_id,
             )
@@ -384,10 +384,10 @@ class SessionCoordinator:
             async with self._work_done:
                 self._work_done.notify_all()
 
+    def _key(self, name: str) -> SubmapKey:
+        session, agent, index = names.parse_submap(name)
+        agent_name = names.agent_name(session, agent)
+        return SubmapKey(agent=agent_name, index=index, name=name, span_s=self.graph.span_of(name))
+
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
-
-
-def _key(name: str) -> SubmapKey:
-    session, agent, index = names.parse_submap(name)
-    return SubmapKey(agent=names.agent_name(session, agent), index=index, name=name)

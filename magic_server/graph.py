@@ -66,6 +66,11 @@ class SessionGraph:
         """The anchor's descriptor (d,) of a sub-map by resource name."""
         return self._vertices[submap].descriptor.vector
 
+    def span_of(self, submap: str) -> tuple[float, float] | None:
+        """Timestamps of a sub-map's first and last frame; None for one that is gone."""
+        vertex = self._vertices.get(submap)
+        return vertex and vertex.span_s
+
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
         self._vertices[vertex.name] = vertex

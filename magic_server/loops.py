@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ class SubmapKey:
     agent: str
     index: int
     name: str
+    span_s: tuple[float, float] | None = None
+    """Timestamps of its first and its last frame, where they are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,9 @@ class LoopConfig:
     it: an older one may have fewer places like it. 0 for none."""
     min_index_gap: int = 2
     """Within an agent, sub-maps nearer in sequence are not loops: odometry links them already."""
+    min_gap_s: float = 0.0
+    """Within an agent, sub-maps with less time than this between their frames are not loops, for a
+    camera that stands still or moves slowly: its many sub-maps show one place."""
     min_neighbour_gap: int = 1
     """Among the candidates of one agent, keep this distance in index (1: no two the same)."""
 
@@ -51,6 +57,8 @@ class LoopConfig:
         for name in ("top_k", "top_k_per_agent", "min_index_gap", "min_neighbour_gap"):
             if getattr(self, name) < 1:
                 raise ConfigError.field(f"loops.{name}", f"{getattr(self, name)}: expected >= 1")
+        if not 0.0 <= self.min_gap_s < math.inf:
+            raise ConfigError.field("loops.min_gap_s", f"{self.min_gap_s}: expected >= 0 seconds")
         if self.ask_older < 0:
             raise ConfigError.field("loops.ask_older", f"{self.ask_older}: expected >= 0")
         if self.min_similarity is not None and not -1.0 <= self.min_similarity <= 1.0:
@@ -87,7 +95,7 @@ def select_candidates(
 ) -> list[LoopCandidate]:
     """The hits worth a registration, most similar first.
 
-    Leaves out the query itself, its neighbours in the same agent, what is less similar than the
+    Leaves out the query itself, its neighbours in sequence or time in the same agent, what is less similar than the
     encoder's threshold, pairs tried before, and more than a few of one agent (diversity).
     """
     if not config.enabled:
@@ -129,10 +137,14 @@ def left_over(
 
 
 def _is_neighbour(query: SubmapKey, hit: SubmapKey, config: LoopConfig) -> bool:
-    same_agent = query.agent == hit.agent
-    return query.name == hit.name or (
-        same_agent and abs(query.index - hit.index) < config.min_index_gap
-    )
+    if query.agent != hit.agent:
+        return False
+    if abs(query.index - hit.index) < config.min_index_gap:
+        return True  # itself too
+    if query.span_s is None or hit.span_s is None:
+        return False
+    gap_s = max(query.span_s[0] - hit.span_s[1], hit.span_s[0] - query.span_s[1])
+    return gap_s < config.min_gap_s
 
 
 def _is_diverse(hit: SubmapKey, chosen: Sequence[LoopCandidate], config: LoopConfig) -> bool:

@@ -329,6 +329,7 @@ class Upload:
     def new_submap(self) -> NewSubmap:
         """Everything for the transaction."""
         session, agent, index = names.parse_submap(self.header.name)
+        frames = self.header.trajectory
         prior = None
         if self.header.HasField("world_from_anchor_prior"):
             prior = geometry.pose_from_proto(self.header.world_from_anchor_prior)
@@ -340,6 +341,7 @@ class Upload:
             odometry=decode_odometry(self.header),
             prior=prior,
             searched=False,
+            span_s=(frames[0].timestamp_s, frames[-1].timestamp_s),
         )
         return NewSubmap(
             header=self.header,

@@ -217,7 +217,10 @@ def _vertex(name: str, edge: Edge | None) -> Vertex:
     agent, index = name.split("/")
     odometry = edge and OdometryEdge(int(index) - 1, edge.source_from_target, edge.information)
     agent_name = names.agent_name(SESSION, agent)
-    return Vertex(_full(name), agent_name, int(index), DESCRIPTOR, odometry, None, searched=True)
+    span_s = (float(index), float(index))
+    return Vertex(
+        _full(name), agent_name, int(index), DESCRIPTOR, odometry, None, searched=True, span_s=span_s
+    )
 
 
 def _loop(edge: Edge) -> records.LoopCandidate:

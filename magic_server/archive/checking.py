@@ -134,6 +134,7 @@ def _submap(
         odometry=decode_odometry(header),
         prior=prior,
         searched=entry.searched,
+        span_s=(header.trajectory[0].timestamp_s, header.trajectory[-1].timestamp_s),
     )
     submap = NewSubmap(
         header=header,

@@ -45,6 +45,8 @@ class Vertex:
     prior: NDArray[np.float64] | None  # world_from_anchor (4, 4)
     searched: bool
     """Whether loop candidates were looked for."""
+    span_s: tuple[float, float]
+    """Timestamps of its first and its last frame, by the agent's clock."""
 
 
 @dataclass(frozen=True, slots=True)

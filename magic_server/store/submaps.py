@@ -241,6 +241,7 @@ def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
         odometry=_odometry(row),
         prior=unpack(row.prior, 4),
         searched=row.searched,
+        span_s=(row.first_timestamp_s, row.last_timestamp_s),
     )
 
 

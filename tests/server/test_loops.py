@@ -8,8 +8,8 @@ from magic_core.errors import ConfigError
 from magic_server.loops import LoopConfig, SubmapKey, left_over, select_candidates
 
 
-def key(agent: str, index: int) -> SubmapKey:
-    return SubmapKey(agent, index, f"{agent}/{index}")
+def key(agent: str, index: int, span_s: tuple[float, float] | None = None) -> SubmapKey:
+    return SubmapKey(agent, index, f"{agent}/{index}", span_s)
 
 
 def names(candidates) -> list[str]:
@@ -26,6 +26,26 @@ def test_leaves_out_itself_and_its_neighbours_in_the_same_agent_only():
     hits = [(key("a", 5), 1.0), (key("a", 4), 0.95), (key("a", 3), 0.9), (key("b", 5), 0.8)]
     config = LoopConfig(min_similarity=0.5, min_index_gap=2)
     assert names(select_candidates(key("a", 5), hits, config)) == ["a/3", "b/5"]
+
+
+def test_leaves_out_what_the_same_agent_saw_a_moment_ago_in_either_direction():
+    hits = [
+        (key("a", 0, (0.0, 9.0)), 0.99),
+        (key("a", 2, (20.0, 28.5)), 0.98),
+        (key("a", 8, (51.0, 60.0)), 0.97),
+        (key("a", 9, (70.0, 80.0)), 0.96),
+        (key("b", 2, (20.0, 28.5)), 0.95),
+    ]
+    config = LoopConfig(min_similarity=0.5, min_gap_s=12.0, top_k_per_agent=9)
+    query = key("a", 5, (40.0, 50.0))
+    assert names(select_candidates(query, hits, config)) == ["a/0", "a/9", "b/2"]
+    assert names(left_over(query, hits, [], config)) == ["a/0", "a/9", "b/2"]
+
+
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_the_time_between_loops_is_a_time(seconds: float):
+    with pytest.raises(ConfigError, match="loops.min_gap_s"):
+        LoopConfig(min_gap_s=seconds)
 
 
 def test_one_agent_cannot_take_all_places():

@@ -51,6 +51,7 @@ def new_submap(submap: Submap, store: Store) -> tuple[NewSubmap, list[BlobWriter
         odometry=decode_odometry(encoded.header),
         prior=None,
         searched=False,
+        span_s=(submap.trajectory[0].timestamp_s, submap.trajectory[-1].timestamp_s),
     )
     digests = tuple(blob.sha256 for blob in blobs)
     return NewSubmap(encoded.header, bytes(32), len(submap.gaussians), digests, vertex), blobs
