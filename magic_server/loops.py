@@ -141,8 +141,8 @@ def _is_neighbour(query: SubmapKey, hit: SubmapKey, config: LoopConfig) -> bool:
         return False
     if abs(query.index - hit.index) < config.min_index_gap:
         return True  # itself too
-    if query.span_s is None or hit.span_s is None:
-        return False
+    if config.min_gap_s == 0.0 or query.span_s is None or hit.span_s is None:
+        return False  # a clock that was set back makes spans overlap
     gap_s = max(query.span_s[0] - hit.span_s[1], hit.span_s[0] - query.span_s[1])
     return gap_s < config.min_gap_s
 

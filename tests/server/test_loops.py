@@ -40,6 +40,8 @@ def test_leaves_out_what_the_same_agent_saw_a_moment_ago_in_either_direction():
     query = key("a", 5, (40.0, 50.0))
     assert names(select_candidates(query, hits, config)) == ["a/0", "a/9", "b/2"]
     assert names(left_over(query, hits, [], config)) == ["a/0", "a/9", "b/2"]
+    again = [(key("a", 0, (40.0, 50.0)), 0.9)]
+    assert names(select_candidates(query, again, LoopConfig(min_similarity=0.5))) == ["a/0"]
 
 
 @pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
