@@ -186,13 +186,16 @@ class SubmapReceiver:
         return upload
 
     async def _taken(self, upload: Upload, messages: Messages, claim: _Claim) -> None:
-        """Receive what is missing. A broken stream leaves what came; a refusal leaves nothing."""
+        """Receive what is missing.
+
+        A stream that breaks or ends early leaves what came; a refusal leaves nothing.
+        """
         claim.taking = asyncio.create_task(self._take(upload, messages))
         if claim.gave_way:  # asked for before there was anything to end
             claim.taking.cancel()
         try:
             await claim.taking
-        except DeadlineExceeded:
+        except (DeadlineExceeded, _EndedEarly):
             await self._finish(self._kept(upload.partial))
             raise
         except asyncio.CancelledError:
@@ -217,8 +220,10 @@ class SubmapReceiver:
             begun = True
         if not upload.complete:
             blob, offset = upload.partial.cursor.position
-            raise InvalidInput.field(
-                "chunk", f"the upload ended early, at byte {offset} of blob {blob}"
+            raise _EndedEarly.field(
+                "chunk",
+                f"the upload ended early, at byte {offset} of blob {blob}; go on where ResumeUpload"
+                " says, or send all of it again",
             )
         if begun and await self._message(messages) is not None:
             raise InvalidInput.field("chunk", "every blob is complete already")
@@ -262,6 +267,14 @@ class SubmapReceiver:
 
     async def _message(self, messages: Messages) -> mapping_pb.SubmitSubmapRequest | None:
         return await next_message(messages, self._limits.upload_idle_s)
+
+
+class _EndedEarly(InvalidInput):
+    """The messages ended before the blobs did.
+
+    Nothing that came is wrong. gRPC also ends the messages of a connection that broke, and only
+    then cancels the call, so that this may be all that is seen of a caller that vanished.
+    """
 
 
 class _Claim:

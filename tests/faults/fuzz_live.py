@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+import contextlib
 import json
 import random
 from collections import Counter
@@ -27,6 +27,7 @@ from magic_server.server import Server
 from tests.faults.fuzz_checks import LIMITS, Material, archive_file
 from tests.faults.mutations import mutate_message, mutated_bytes, mutated_gaussians
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.waiting import eventually
 
 DEADLINE_S = 60.0
 SAID_EVERY = 50
@@ -93,16 +94,26 @@ async def _code(call: Any, rng: random.Random) -> tuple[str, str]:
 
 
 async def _stray_files(client: MagicClient, folder: Path) -> list[Path]:
-    """Files that no stored sub-map refers to."""
+    """Files that no stored sub-map refers to.
+
+    Uploads that ended early wait to be gone on with, and go with their sessions.
+    """
     wanted: set[str] = set()
     for session in await client.list_sessions():
         for info in await client.list_submaps(session.name.removeprefix("sessions/")):
             _, header = await client.get_submap(info.name)
             wanted |= {blob.sha256.hex() for blob in header.blobs}
-    await asyncio.sleep(0.5)  # uploads that were broken off are tidied up behind their answer
     found = [file for file in (folder / "blobs").rglob("*") if file.is_file()]
-    incoming = [*(folder / "incoming").rglob("*"), *(folder / "uploads").rglob("*")]
-    return [file for file in found if file.name not in wanted] + incoming
+    found = [file for file in found if file.name not in wanted]
+    for session in await client.list_sessions():
+        await client.delete_session(session.name.removeprefix("sessions/"), force=True)
+
+    def unfinished() -> list[Path]:
+        return [*(folder / "incoming").rglob("*"), *(folder / "uploads").rglob("*")]
+
+    with contextlib.suppress(TimeoutError):  # some are tidied up behind their answer
+        await eventually(lambda: not unfinished())
+    return found + unfinished()
 
 
 def _callers(channel: grpc.aio.Channel, material: Material) -> list[tuple[str, Any]]:

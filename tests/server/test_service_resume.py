@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import os
+import struct
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 
 import grpc
 import grpc.aio
@@ -16,7 +19,14 @@ from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import submap_pb2 as submap_pb
 
 from magic_agent.client import MagicClient
-from magic_core.errors import AlreadyExists, InvalidInput, MagicError, NotFound, Unavailable
+from magic_core.errors import (
+    AlreadyExists,
+    CorruptData,
+    InvalidInput,
+    MagicError,
+    NotFound,
+    Unavailable,
+)
 from magic_core.wire import EncodedSubmap, chunks_of, encode_submap, error_of
 from magic_server.config import ServerConfig, ServiceLimits
 from magic_server.server import Server
@@ -73,9 +83,19 @@ async def send(server: Server, sent: Requests, *, hold: bool = False) -> str:
 
 
 def held_bytes(server: Server) -> int:
-    """Bytes of blobs that lie in the folder of uploads."""
-    folder = server._store.scratch / "uploads"
-    return sum(file.stat().st_size for file in folder.glob("*/[0-9]*"))
+    """Bytes that lie in the folder of uploads, as the journals say, which are written last."""
+    found = 0
+    for folder in files_of_uploads(server):
+        with contextlib.suppress(FileNotFoundError):  # gone since it was listed
+            journal = (folder / "journal").read_bytes()
+            records = struct.iter_unpack("<II", journal[: len(journal) // 8 * 8])
+            found += sum(length for length, _ in records)
+    return found
+
+
+def files_of_uploads(server: Server) -> list[Path]:
+    """What the folder of uploads holds."""
+    return list((server._store.scratch / "uploads").iterdir())
 
 
 def ends_blob(submap: EncodedSubmap, chunk: submap_pb.BlobChunk) -> bool:
@@ -122,7 +142,7 @@ async def test_a_broken_stream_goes_on_behind_the_last_byte_that_came(
     assert await send(server, rest) == NAME
     found = await registered.download_encoded(NAME)
     assert (found.header, found.blobs) == (submap.header, submap.blobs)
-    assert list((server._store.scratch / "uploads").iterdir()) == []
+    assert files_of_uploads(server) == []
 
 
 async def test_a_server_that_was_killed_goes_on_with_what_had_come(
@@ -184,7 +204,17 @@ async def test_a_new_stream_takes_over_from_one_that_looks_alive(
 
 
 async def test_a_stream_that_is_only_being_admitted_gives_way_too(
-    registered: MagicClient, server: Server, monkeypatch: pytest.MonkeyPatch
+    server_config: ServerConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It must not be the silence that ends the stream.
+    config = dataclasses.replace(server_config, limits=ServiceLimits(upload_idle_s=600.0))
+    async with Server(config) as server, MagicClient(server.address) as client:
+        await register(client)
+        await _asked_for_while_being_admitted(client, server, monkeypatch)
+
+
+async def _asked_for_while_being_admitted(
+    client: MagicClient, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     receiver, entered, go = server._receiver, asyncio.Event(), asyncio.Event()
     admit = receiver._require_admission
@@ -198,13 +228,78 @@ async def test_a_stream_that_is_only_being_admitted_gives_way_too(
     stale = asyncio.create_task(send(server, messages(encoded())[:1], hold=True))
     await entered.wait()
     (claim,) = receiver._claims.values()
-    asking = asyncio.create_task(registered.resume_upload(NAME, "first"))
+    asking = asyncio.create_task(client.resume_upload(NAME, "first"))
     await eventually(lambda: claim.gave_way)
     go.set()
-    async with asyncio.timeout(server.config.limits.upload_idle_s / 2):
+    async with asyncio.timeout(120.0):
         assert (await asking).durable_bytes == 0
     with pytest.raises(Unavailable, match="taken over"):
         await stale
+
+
+async def test_a_stream_that_ends_early_goes_on_where_it_ended(
+    registered: MagicClient, server: Server
+) -> None:
+    submap = encoded()
+    sent = messages(submap)[:10]
+    with pytest.raises(InvalidInput, match=r"ended early.*ResumeUpload"):
+        await send(server, sent)
+    assert server_kept(server) == (1, payload(sent))
+    position = await registered.resume_upload(NAME, "first")
+    assert position.durable_bytes == payload(sent)
+    rest = messages(submap, blob=position.blob_index, offset=position.offset)
+    assert await send(server, rest) == NAME
+    assert (await registered.download_encoded(NAME)).blobs == submap.blobs
+    assert files_of_uploads(server) == []
+
+
+def _wrong_checksum(chunk: submap_pb.BlobChunk) -> None:
+    chunk.crc32 ^= 1
+
+
+def _gap(chunk: submap_pb.BlobChunk) -> None:
+    chunk.offset += 1
+
+
+def _another_blob(chunk: submap_pb.BlobChunk) -> None:
+    chunk.blob_index += 1
+
+
+def _beyond_the_blob(chunk: submap_pb.BlobChunk) -> None:
+    longer = next(chunks_of(bytes(900_000)))
+    chunk.data, chunk.crc32 = longer.data, longer.crc32
+
+
+def _empty(chunk: submap_pb.BlobChunk) -> None:
+    chunk.data, chunk.crc32 = b"", 0
+
+
+@pytest.mark.parametrize(
+    ("damage", "kind"),
+    [
+        (_wrong_checksum, CorruptData),
+        (_gap, InvalidInput),
+        (_another_blob, InvalidInput),
+        (_beyond_the_blob, InvalidInput),
+        (_empty, InvalidInput),
+    ],
+)
+async def test_a_stream_that_is_wrong_leaves_nothing_of_what_was_right(
+    damage: Callable[[submap_pb.BlobChunk], None],
+    kind: type[MagicError],
+    registered: MagicClient,
+    server: Server,
+) -> None:
+    submap = encoded()
+    sent = messages(submap)[:10]
+    damage(sent[-1].chunk)
+    with pytest.raises(kind) as caught:
+        await send(server, sent)
+    assert type(caught.value) is kind
+    assert server_kept(server) == (0, 0)
+    assert files_of_uploads(server) == []
+    assert (await registered.resume_upload(NAME, "first")).durable_bytes == 0
+    assert await send(server, messages(submap)) == NAME
 
 
 async def test_a_stream_from_the_beginning_starts_over(
@@ -241,7 +336,7 @@ async def test_a_refusal_after_resuming_leaves_nothing(
     rest[-1].chunk.data, rest[-1].chunk.crc32 = changed.data, changed.crc32
     with pytest.raises(MagicError, match="SHA-256"):
         await send(server, rest)
-    assert list((server._store.scratch / "uploads").iterdir()) == []
+    assert files_of_uploads(server) == []
     assert (await registered.resume_upload(NAME, "first")).durable_bytes == 0
 
 
