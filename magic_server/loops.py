@@ -95,8 +95,9 @@ def select_candidates(
 ) -> list[LoopCandidate]:
     """The hits worth a registration, most similar first.
 
-    Leaves out the query itself, its neighbours in sequence or time in the same agent, what is less similar than the
-    encoder's threshold, pairs tried before, and more than a few of one agent (diversity).
+    Leaves out the query itself, its neighbours in the same agent by number or time, what is less
+    similar than the encoder's threshold, pairs tried before, and more than a few of one agent
+    (diversity).
     """
     if not config.enabled:
         return []

@@ -219,7 +219,14 @@ def _vertex(name: str, edge: Edge | None) -> Vertex:
     agent_name = names.agent_name(SESSION, agent)
     span_s = (float(index), float(index))
     return Vertex(
-        _full(name), agent_name, int(index), DESCRIPTOR, odometry, None, searched=True, span_s=span_s
+        _full(name),
+        agent_name,
+        int(index),
+        DESCRIPTOR,
+        odometry,
+        None,
+        searched=True,
+        span_s=span_s,
     )
 
 

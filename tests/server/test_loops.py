@@ -46,7 +46,7 @@ def test_leaves_out_what_the_same_agent_saw_a_moment_ago_in_either_direction():
 
 @pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
 def test_the_time_between_loops_is_a_time(seconds: float):
-    with pytest.raises(ConfigError, match="loops.min_gap_s"):
+    with pytest.raises(ConfigError, match=r"loops\.min_gap_s"):
         LoopConfig(min_gap_s=seconds)
 
 
