@@ -27,7 +27,7 @@ from magic_server.jobs.tasks import (
     read_progress,
 )
 from magic_server.sessions import Sessions
-from magic_server.store import BlobWriter, MapFile, NewMap, SessionRow, Store
+from magic_server.store import MapFile, NewMap, SessionRow, Store, WrittenBlob
 from magic_server.store.blobs import translated_disk_errors
 from magic_server.tasks import TaskScope
 
@@ -228,7 +228,7 @@ class GlobalMaps:
             "compact": outcome.compact,
         }
         files: dict[records.MapFormat, MapFile] = {}
-        written: list[BlobWriter] = []
+        written: list[WrittenBlob] = []
         for kind, path in paths.items():
             blob = await self._in_thread(self._copied, path)
             written.append(blob)
@@ -243,7 +243,7 @@ class GlobalMaps:
         now = time.time()
         await self._store.add_map(operation, session, made, written=written, now=now)
 
-    def _copied(self, path: Path) -> BlobWriter:
+    def _copied(self, path: Path) -> WrittenBlob:
         """A file of a merge as a blob that is ready to be adopted."""
         blob = self._store.blobs.writer()
         with path.open("rb") as file:

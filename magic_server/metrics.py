@@ -15,6 +15,7 @@ from prometheus_client import (
 )
 
 _RPC_BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
+_BLOB_BUCKETS_S = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)
 _JOB_BUCKETS_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 300, 1800)
 
 
@@ -83,6 +84,19 @@ class Metrics:
         self.audit_failures = Counter(
             "magic_audit_failures", "Audit lines that could not be written.", registry=registry
         )
+        self.blob_requests = Counter(
+            "magic_blob_requests",
+            "Requests to the bucket, by operation and outcome: ok, missing or failed.",
+            ("operation", "outcome"),
+            registry=registry,
+        )
+        self.blob_seconds = Histogram(
+            "magic_blob_seconds",
+            "Time of a request to the bucket, tries again included.",
+            ("operation",),
+            buckets=_BLOB_BUCKETS_S,
+            registry=registry,
+        )
         self._queues = Gauge(
             "magic_queue_depth", "What waits in a queue, by queue.", ("queue",), registry=registry
         )
@@ -93,6 +107,11 @@ class Metrics:
         if outcome == "ok":
             self.job_seconds.labels(job).observe(ran_s)
             self.job_wait_seconds.labels(job).observe(waited_s)
+
+    def blob_request(self, operation: str, outcome: str, seconds: float) -> None:
+        """Count a request to the bucket."""
+        self.blob_requests.labels(operation, outcome).inc()
+        self.blob_seconds.labels(operation).observe(seconds)
 
     def watch_queue(self, queue: str, depth: Callable[[], float]) -> None:
         """Publish a queue's depth; `depth` is called from another thread at every scrape."""

@@ -39,11 +39,15 @@ class ProbePort:
     """Serves metrics and health over HTTP."""
 
     def __init__(
-        self, config: MetricsConfig, registry: CollectorRegistry, *, ready: Callable[[], bool]
+        self,
+        config: MetricsConfig,
+        registry: CollectorRegistry,
+        *,
+        trouble: Callable[[], str | None],
     ) -> None:
-        """`ready` is called from another thread."""
+        """`trouble` says why the server is not ready, None while it is; from another thread."""
         self._metrics = make_wsgi_app(registry)
-        self._ready = ready
+        self._trouble = trouble
         assert config.port is not None  # whoever wants no port makes none
         try:
             self._http = make_server(
@@ -75,9 +79,11 @@ class ProbePort:
                 start("200 OK", list(_TEXT))
                 return [b"alive\n"]
             case "/readyz":
-                ready = self._ready()
-                start("200 OK" if ready else "503 Service Unavailable", list(_TEXT))
-                return [b"ready\n" if ready else b"not ready\n"]
+                trouble = self._trouble()
+                start("200 OK" if trouble is None else "503 Service Unavailable", list(_TEXT))
+                if trouble is None:
+                    return [b"ready\n"]
+                return [f"not ready: {trouble}\n".encode() if trouble else b"not ready\n"]
         start("404 Not Found", list(_TEXT))
         return [b"/metrics, /livez, /readyz\n"]
 

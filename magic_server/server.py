@@ -27,6 +27,7 @@ from magic_core.errors import Unavailable
 from magic_core.wire import server_options
 from magic_server.access import AccessControl
 from magic_server.audit import AuditLog
+from magic_server.blob_watch import BlobWatch
 from magic_server.calls import CallDesk
 from magic_server.config import LOOPBACK, ServerConfig
 from magic_server.drain import Gate
@@ -91,6 +92,7 @@ class Server:
             partial_uploads=config.limits.partial_uploads,
             config=config.store,
             replica=config.cluster.name(config.listen.port),
+            observer=self.metrics.blob_request,
         )
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
         self.sessions = Sessions(self._store, metrics=self.metrics, **shared)
@@ -141,6 +143,7 @@ class Server:
         self._upkeep = Upkeep(
             self._store, threads=self._threads, interval_s=config.limits.upkeep_interval_s
         )
+        self._watch = BlobWatch(self._store.blobs, on_change=self._tell_readiness)
         self._probes: ProbePort | None = None
         self._health_port: HealthPort | None = None
 
@@ -188,6 +191,7 @@ class Server:
                 await self._leasing.start(self._public_address())
             self._upkeep.start()
             await self._previews.start()
+            self._watch.start()
             self.gate.open()
             await self._set_ready(True)
         except BaseException:
@@ -217,6 +221,7 @@ class Server:
                 logger.warning("%d calls did not end in time and are cut", self.gate.calls)
             await self._grpc.stop(LAST_ANSWERS_S)
             self._grpc = None
+        await self._watch.close()
         await self._upkeep.close()
         await self._receiver.close()
         await self._maps.close()
@@ -268,7 +273,7 @@ class Server:
         if self.config.metrics.port is not None:
             self._observe()
             self._probes = ProbePort(
-                self.config.metrics, self.metrics.registry, ready=lambda: self.gate.ready
+                self.config.metrics, self.metrics.registry, trouble=self._trouble
             )
 
     def _observe(self) -> None:
@@ -284,7 +289,18 @@ class Server:
         metrics.watch("magic_disk_free_bytes", "Free on the store's disk.", lambda: room().disk)
         metrics.watch("magic_memory_free_bytes", "Memory left.", lambda: room().memory)
         metrics.watch("magic_job_slots", "Jobs at once, now.", lambda: float(self._jobs.slots))
-        metrics.watch("magic_ready", "1 while calls are taken.", lambda: float(gate.ready))
+        metrics.watch("magic_ready", "1 while calls are taken.", lambda: float(self._ready))
+
+    @property
+    def _ready(self) -> bool:
+        return self.gate.ready and not self._watch.trouble
+
+    def _trouble(self) -> str | None:
+        """Why the server is not ready, None while it is."""
+        return None if self._ready else self._watch.trouble
+
+    async def _tell_readiness(self) -> None:
+        await self._set_ready(self._ready)
 
     async def _set_ready(self, ready: bool) -> None:
         states = health_pb2.HealthCheckResponse

@@ -23,7 +23,7 @@ class Upkeep:
         self._tasks = TaskScope("upkeep")
 
     def start(self) -> None:
-        """Begin; the store has just been tidied by its start."""
+        """Begin; the store has just been tidied by its start, a bucket is now."""
         self._tasks.start(self._for_ever(), name="tidying")
 
     async def close(self) -> None:
@@ -38,8 +38,10 @@ class Upkeep:
         return await self._store.collect_orphans(), uploads
 
     async def _for_ever(self) -> None:
+        wait = not self._store.blobs.far
         while True:
-            await asyncio.sleep(self._interval_s)
+            await asyncio.sleep(self._interval_s if wait else 0.0)
+            wait = True
             try:
                 blobs, uploads = await self.tidy()
             except Exception:

@@ -14,7 +14,7 @@ from magic_core.errors import CorruptData, InvalidInput, MagicError
 from magic_core.wire import SubmapLimits, check_blob, check_header, convert, geometry, names
 from magic_core.wire.header_check import request_id_problem
 from magic_core.wire.submap import decode_odometry
-from magic_server.store import BlobWriter, ImportedSubmap, NewSubmap, Vertex, require_model
+from magic_server.store import ImportedSubmap, NewSubmap, Vertex, WrittenBlob, require_model
 from magic_server.store.rows import SessionRow
 
 MAX_ROW = 2**62
@@ -22,7 +22,7 @@ _VERDICTS = ("PENDING", "ACCEPTED", "REJECTED")
 
 
 def check_archive(
-    archive: archive_pb2.SessionArchive, blobs: Mapping[str, BlobWriter], limits: SubmapLimits
+    archive: archive_pb2.SessionArchive, blobs: Mapping[str, WrittenBlob], limits: SubmapLimits
 ) -> list[ImportedSubmap]:
     """The sub-maps of an archive, ready to be stored. Slow: every blob is decoded.
 
@@ -111,7 +111,7 @@ def _submap(
     entry: archive_pb2.ArchivedSubmap,
     session: SessionRow,
     numbers: set[tuple[str, int]],
-    blobs: Mapping[str, BlobWriter],
+    blobs: Mapping[str, WrittenBlob],
     limits: SubmapLimits,
 ) -> ImportedSubmap:
     header = entry.header
@@ -148,13 +148,13 @@ def _submap(
 
 
 def _checked_blob(
-    header: submap_pb2.SubmapHeader, number: int, blobs: Mapping[str, BlobWriter]
+    header: submap_pb2.SubmapHeader, number: int, blobs: Mapping[str, WrittenBlob]
 ) -> int:
     info = header.blobs[number]
     blob = blobs.get(info.sha256.hex())
     if blob is None or blob.length != info.length:
         raise CorruptData(f"blobs[{number}] is not in the archive, or of another length")
-    return check_blob(header, number, blob.path.read_bytes())
+    return check_blob(header, number, blob.content())
 
 
 def _check_removed(entry: archive_pb2.ArchivedRemoval, numbers: set[tuple[str, int]]) -> None:
@@ -226,7 +226,7 @@ def _check_map(
     entry: archive_pb2.ArchivedMap,
     session: str,
     stored: set[str],
-    blobs: Mapping[str, BlobWriter],
+    blobs: Mapping[str, WrittenBlob],
 ) -> None:
     info = convert.map_from_proto(entry.map)
     _require(names.parse_map(info.name)[0] == session, "map.name", "of another session")
@@ -241,7 +241,9 @@ def _check_map(
             raise CorruptData("a file of the map is not in the archive, or of another length")
 
 
-def _check_blobs_used(archive: archive_pb2.SessionArchive, blobs: Mapping[str, BlobWriter]) -> None:
+def _check_blobs_used(
+    archive: archive_pb2.SessionArchive, blobs: Mapping[str, WrittenBlob]
+) -> None:
     used = {blob.sha256.hex() for entry in archive.submaps for blob in entry.header.blobs}
     used |= {file.sha256.hex() for entry in archive.maps for file in entry.files}
     if strays := sorted(set(blobs) - used):

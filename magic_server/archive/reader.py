@@ -11,23 +11,23 @@ from magicslam.v1 import archive_pb2
 from magic_core.errors import CorruptData, InvalidInput
 from magic_server.archive import layout
 from magic_server.archive.layout import BLOCK, Member
-from magic_server.store import BlobFolder, BlobWriter
+from magic_server.store import BlobStore, WrittenBlob
 
 
 class ArchiveReader:
     """Takes the bytes of one archive. Every method blocks.
 
-    Blobs go to the store's folder of incoming files; `discard` removes what was not adopted.
+    Blobs go to where the store has what is on its way in; `discard` removes what was not adopted.
     """
 
-    def __init__(self, folder: BlobFolder, *, max_bytes: int | None = None) -> None:
+    def __init__(self, store: BlobStore, *, max_bytes: int | None = None) -> None:
         self.archive = archive_pb2.SessionArchive()
-        self.blobs: dict[str, BlobWriter] = {}
+        self.blobs: dict[str, WrittenBlob] = {}
         self.manifest_sha256 = b""
         """Of the manifest, which holds the digests of all other files."""
         self.knows_session = False
         """Whether `archive` is read; what it says is not checked yet."""
-        self._folder = folder
+        self._store = store
         self._max_bytes = max_bytes
         self._buffer = bytearray()
         self._script = self._read()
@@ -55,7 +55,7 @@ class ArchiveReader:
             raise CorruptData("the archive ends early; transfer it again")
 
     def discard(self) -> None:
-        """Remove every file that was not adopted."""
+        """Remove every blob that was not adopted."""
         for blob in self.blobs.values():
             blob.discard()
 
@@ -95,7 +95,7 @@ class ArchiveReader:
         self.knows_session = True
 
     def _blob(self, member: Member) -> Generator[int, bytes, None]:
-        blob = self.blobs[member.sha256] = self._folder.writer()
+        blob = self.blobs[member.sha256] = self._store.writer()
         while left := member.length - blob.length:
             blob.write((yield min(left, 1 << 20)))
         if blob.sha256 != member.sha256:

@@ -1,4 +1,4 @@
-"""The jobs: functions that run in a worker process. They read blobs from disk by path."""
+"""The jobs: functions that run in a worker process. They read blobs wherever the store has them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from magic_core.errors import MagicError
 from magic_core.geometry import Camera
 from magic_core.wire import geometry, images
 from magic_server.jobs.attempt import Attempt, made_whole
-from magic_server.store.blobs import read_checked
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
@@ -74,14 +73,14 @@ class StoredSource:
         """The Gaussians, in the anchor frame."""
         from magic_core.gaussians import codec
 
-        return codec.decode(read_checked(self.stored.blobs[self.header.gaussians_blob]))
+        return codec.decode(self.stored.blobs[self.header.gaussians_blob].read())
 
     def gaussian_count(self) -> int:
         """How many there are, without decoding them."""
         from magic_core.gaussians import codec
 
-        with self.stored.blobs[self.header.gaussians_blob].open("rb") as file:
-            return codec.gaussian_count(file.read(codec.HEADER_BYTES))
+        blob = self.stored.blobs[self.header.gaussians_blob]
+        return codec.gaussian_count(blob.head(codec.HEADER_BYTES))
 
     def keyframe_poses(self) -> list[np.ndarray]:
         """anchor_from_camera (4, 4) of every keyframe."""
@@ -279,7 +278,7 @@ def _view(stored: StoredSubmap, config: RegistrationConfig) -> AnchorView:
     if "means" in config.methods:
         from magic_core.gaussians import codec
 
-        means = codec.decode(read_checked(stored.blobs[header.gaussians_blob])).means
+        means = codec.decode(stored.blobs[header.gaussians_blob].read()).means
     return AnchorView(camera, colour, depth, tuple(keyframes), means)
 
 
@@ -289,12 +288,12 @@ def _images(
     message = header.keyframes[keyframe]
     size = (header.camera.width, header.camera.height)
     colour = images.decode_colour(
-        read_checked(stored.blobs[message.colour_blob]),
+        stored.blobs[message.colour_blob].read(),
         header.blobs[message.colour_blob].media_type,
         size=size,
     )
     depth = images.decode_depth(
-        read_checked(stored.blobs[message.depth_blob]),
+        stored.blobs[message.depth_blob].read(),
         metres_per_unit=header.blobs[message.depth_blob].metres_per_unit,
         size=size,
     )

@@ -12,12 +12,11 @@ from magicslam.v1 import submap_pb2
 
 from magic_core.errors import CorruptData
 from magic_core.wire import MAX_CHUNK_BYTES
-from magic_server.store import BlobFolder
-from magic_server.store.blobs import damage
+from magic_server.store import BlobStore
 
 
 async def file_chunks(
-    blobs: BlobFolder, sha256: str, threads: Executor, *, blob_index: int = 0
+    blobs: BlobStore, sha256: str, threads: Executor, *, blob_index: int = 0
 ) -> AsyncIterator[submap_pb2.BlobChunk]:
     """A blob as chunk messages, read one at a time as the receiver takes them.
 
@@ -30,7 +29,7 @@ async def file_chunks(
         data = blobs.read_piece(sha256, offset, MAX_CHUNK_BYTES)
         digest.update(data)
         if len(data) < MAX_CHUNK_BYTES and digest.hexdigest() != sha256:
-            raise CorruptData(damage(blobs.path(sha256)))
+            raise CorruptData(blobs.damage(sha256))
         if not data:
             return None
         return submap_pb2.BlobChunk(

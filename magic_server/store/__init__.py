@@ -3,6 +3,7 @@
 from magic_server.store.agents import Registration, require_model
 from magic_server.store.answers import Asked
 from magic_server.store.archive import ImportedSubmap, archive_of
+from magic_server.store.blob_store import BlobObserver, BlobStore, WrittenBlob
 from magic_server.store.blobs import BlobFolder, BlobWriter
 from magic_server.store.deletions import Deleted, DeletionRequest, NewSolution
 from magic_server.store.imports import Imported, ImportRequest
@@ -25,6 +26,8 @@ __all__ = [
     "AgentRow",
     "Asked",
     "BlobFolder",
+    "BlobObserver",
+    "BlobStore",
     "BlobWriter",
     "Deleted",
     "DeletionRequest",
@@ -47,6 +50,7 @@ __all__ = [
     "UploadFolder",
     "UploadName",
     "Vertex",
+    "WrittenBlob",
     "archive_of",
     "require_model",
 ]

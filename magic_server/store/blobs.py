@@ -14,10 +14,12 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 from magic_core.errors import CorruptData, DiskFull, NotFound
+from magic_server.store.blob_store import WrittenBlob
 
 _READ_BYTES = 1 << 20
 SYNCS_AT_ONCE = 8
@@ -25,8 +27,27 @@ DISK_RETRY_S = 15.0
 """How long callers are asked to wait when the disk is full."""
 
 
+@dataclass(frozen=True, slots=True)
+class FileBlob:
+    """A blob in a file."""
+
+    path: Path
+
+    def read(self) -> bytes:
+        """All of it, checked. NotFound without it, CorruptData when it is not what it was."""
+        return read_checked(self.path)
+
+    def head(self, length: int) -> bytes:
+        """Its first bytes, unchecked."""
+        with self.path.open("rb") as file:
+            return file.read(length)
+
+
 class BlobFolder:
     """Files named by the SHA-256 of their content."""
+
+    far = False
+    shards: Sequence[str] = ("",)
 
     def __init__(self, root: Path, scratch: Path | None = None) -> None:
         """`scratch`: a folder on the same disk for what is being written, else the same one."""
@@ -41,20 +62,30 @@ class BlobFolder:
             if leftover.is_file():
                 leftover.unlink()
 
+    def check(self) -> None:
+        """Nothing: the folder was there when the server started."""
+
     def path(self, sha256: str) -> Path:
         """Where a blob is, or would be."""
         return self.blobs / sha256[0] / sha256
+
+    def blob(self, sha256: str) -> FileBlob:
+        """A blob for a job to read."""
+        return FileBlob(self.path(sha256))
 
     def writer(self) -> BlobWriter:
         """Begin a new blob."""
         return BlobWriter(self.incoming)
 
-    def adopt(self, written: Iterable[BlobWriter]) -> list[str]:
+    async def bring(self, written: Sequence[WrittenBlob], threads: Executor) -> None:
+        """Nothing: sub-maps that wait together are synced together, see `SubmapCommits`."""
+
+    def adopt(self, written: Iterable[WrittenBlob]) -> list[str]:
         """Move complete blobs to their places, durably; returns the digests that are new.
 
         A stored file with other content than its name says is replaced: it was damaged.
         """
-        written = list(written)
+        written = [blob for blob in written if isinstance(blob, BlobWriter)]
         sync_all([blob.path for blob in written if not blob.synced])
         fresh, folders = [], set[Path]()
         for blob in written:
@@ -80,10 +111,10 @@ class BlobFolder:
         places = [self.path(sha256) for sha256 in digests]
         return sum(place.stat().st_size for place in places if place.exists())
 
-    def names(self) -> Iterator[str]:
-        """The digest of every stored blob."""
-        for folder in sorted(self.blobs.iterdir()):
-            yield from sorted(entry.name for entry in folder.iterdir())
+    def names(self, shard: str = "") -> Iterator[str]:
+        """The digest of every stored blob that begins like this."""
+        for folder in sorted(self.blobs.glob(f"{shard[:1]}*")):
+            yield from sorted(entry.name for entry in folder.glob(f"{shard}*"))
 
     def read(self, sha256: str) -> bytes:
         """A blob's bytes, checked against its name."""
@@ -98,6 +129,10 @@ class BlobFolder:
         except FileNotFoundError:
             raise NotFound("what is being read has been deleted") from None
 
+    def damage(self, sha256: str) -> str:
+        """What is wrong with a stored file that does not match its name, and what helps."""
+        return damage(self.path(sha256))
+
 
 class SharedBlobFolder(BlobFolder):
     """A folder that other servers write to as well.
@@ -106,7 +141,7 @@ class SharedBlobFolder(BlobFolder):
     is not known to have failed: what nothing refers to is collected later, see `CommitLock`.
     """
 
-    def adopt(self, written: Iterable[BlobWriter]) -> list[str]:
+    def adopt(self, written: Iterable[WrittenBlob]) -> list[str]:
         """Move complete blobs to their places, durably. Nothing is to be taken back."""
         super().adopt(written)
         return []
@@ -155,6 +190,10 @@ class BlobWriter:
         """Nothing is appended afterwards; `BlobFolder.adopt` brings it to the disk."""
         self.flush()
         self._file.close()
+
+    def content(self) -> bytes:
+        """All of a finished blob."""
+        return self.path.read_bytes()
 
     def close(self) -> None:
         """Close the file, whatever state it is in."""

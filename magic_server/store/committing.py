@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from magic_core.errors import HeldElsewhere, Unavailable
-from magic_server.store.blobs import BlobFolder, BlobWriter
+from magic_server.store.blob_store import BlobStore, WrittenBlob
 from magic_server.store.commit_lock import CommitLock
 from magic_server.store.rows import AgentRow, NewSubmap
 from magic_server.store.submaps import Arrival, FirstAnswer, SubmapTable
@@ -32,7 +32,7 @@ class _Waiting:
     """A sub-map whose sender waits for its answer."""
 
     arrival: Arrival
-    written: Sequence[BlobWriter]
+    written: Sequence[WrittenBlob]
     answer: asyncio.Future[FirstAnswer | None]
 
     @property
@@ -58,7 +58,7 @@ class SubmapCommits:
     """Makes sub-maps durable, those together that wait together."""
 
     def __init__(
-        self, submaps: SubmapTable, blobs: BlobFolder, *, lock: CommitLock, threads: Executor
+        self, submaps: SubmapTable, blobs: BlobStore, *, lock: CommitLock, threads: Executor
     ) -> None:
         """`lock` keeps everybody else from relying on blobs that are taken back."""
         self._submaps = submaps
@@ -70,13 +70,14 @@ class SubmapCommits:
         self._working = False
 
     async def add(
-        self, agent: AgentRow, submap: NewSubmap, written: Sequence[BlobWriter], *, now: float
+        self, agent: AgentRow, submap: NewSubmap, written: Sequence[WrittenBlob], *, now: float
     ) -> FirstAnswer | None:
         """Make one sub-map durable: its blobs, then a transaction.
 
         Returns what was answered before when another request stored the same sub-map meanwhile.
         Nothing is left behind when it fails. A caller that is cancelled does not undo it.
         """
+        await self._blobs.bring(written, self._threads)
         answer = asyncio.get_running_loop().create_future()
         self._waiting.append(_Waiting(Arrival(agent, submap, now), written, answer))
         if not self._working:

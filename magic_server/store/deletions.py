@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -10,8 +11,8 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import NotFound
-from magic_server.store.blobs import BlobFolder
+from magic_core.errors import NotFound, Unavailable
+from magic_server.store.blob_store import BlobStore
 from magic_server.store.commit_lock import CommitLock
 from magic_server.store.database import Database
 from magic_server.store.rows import AgentRow, SessionRow
@@ -30,6 +31,8 @@ from magic_server.store.schema import (
     submap_blobs,
     submaps,
 )
+
+logger = logging.getLogger(__name__)
 
 _BATCH = 500
 REMEMBERED_S = 30 * 86400.0
@@ -66,7 +69,7 @@ class Deletions:
     """Takes things out of the store; nothing else can be added meanwhile."""
 
     def __init__(
-        self, database: Database, blobs: BlobFolder, *, lock: CommitLock, threads: Executor
+        self, database: Database, blobs: BlobStore, *, lock: CommitLock, threads: Executor
     ) -> None:
         self._database = database
         self._blobs = blobs
@@ -169,7 +172,10 @@ class Deletions:
     async def _remove(self, orphans: list[str]) -> None:
         # A server that dies here leaves files that nothing refers to; its next start removes them.
         loop = asyncio.get_running_loop()
-        await asyncio.shield(loop.run_in_executor(self._threads, self._blobs.remove, orphans))
+        try:
+            await asyncio.shield(loop.run_in_executor(self._threads, self._blobs.remove, orphans))
+        except Unavailable as error:  # what was deleted is deleted
+            logger.warning("%d deleted blobs are removed later: %s", len(orphans), error)
 
 
 async def _unused(connection: AsyncConnection, digests: Sequence[str]) -> list[str]:

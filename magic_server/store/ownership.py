@@ -38,16 +38,21 @@ def require_own_database(folder: Path) -> None:
         )
 
 
-def require_database(folder: Path, identity: str, *, is_new: bool) -> None:
-    """Raise WrongState unless the folder's blobs are those of this database.
-
-    `is_new`: the database was begun just now, and with it the folder.
-    """
+def require_no_sqlite(folder: Path) -> None:
+    """Raise WrongState where the folder has sessions that a PostgreSQL database does not know."""
     if (folder / _SQLITE).exists():
         raise WrongState(
             f"{folder} holds sessions in {_SQLITE}, which store.database does not know; move them "
             "with `magic sessions export` and `import`, and choose another data folder"
         )
+
+
+def require_database(folder: Path, identity: str, *, is_new: bool) -> None:
+    """Raise WrongState unless the folder's blobs are those of this database.
+
+    `is_new`: the database was begun just now, and with it the folder.
+    """
+    require_no_sqlite(folder)
     file = folder / _ID_FILE
     if is_new and not file.exists():
         file.write_text(f"{identity}\n")

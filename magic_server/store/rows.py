@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from magicslam.v1 import submap_pb2
 from numpy.typing import ArrayLike, NDArray
 
 from magic_core.submap import Descriptor, OdometryEdge
+from magic_server.store.blob_store import StoredBlob
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +72,11 @@ class NewSubmap:
 
 @dataclass(frozen=True, slots=True)
 class StoredSubmap:
-    """A stored sub-map's header and where its blobs are."""
+    """A stored sub-map's header and its blobs."""
 
     header: bytes
     """magicslam.v1.SubmapHeader, serialised: what is cheap to hand to another process."""
-    blobs: tuple[Path, ...]
+    blobs: tuple[StoredBlob, ...]
     """In the header's order."""
 
 

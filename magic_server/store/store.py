@@ -1,4 +1,4 @@
-"""The store of one server: a database and a blob folder, consistent at every instant.
+"""The store of one server: a database and its blobs, consistent at every instant.
 
 Blobs are written, synced and moved to their places first; one transaction then refers to them. A
 server that dies in between leaves blobs that nothing refers to, which the next start removes.
@@ -11,20 +11,22 @@ import logging
 import os
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import sqlalchemy as sa
 from magicslam.v1 import archive_pb2
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from magic_core.errors import ConfigError
+from magic_core.errors import ConfigError, WrongState
 from magic_server.store import ownership
 from magic_server.store.agents import AgentTable
 from magic_server.store.archive import ArchiveTable, ImportedSubmap
-from magic_server.store.blobs import BlobFolder, BlobWriter, SharedBlobFolder
+from magic_server.store.blob_store import BlobObserver, BlobStore, WrittenBlob
+from magic_server.store.blobs import BlobFolder, SharedBlobFolder
+from magic_server.store.bucket import BucketBlobs, bucket_place
 from magic_server.store.commit_lock import CommitLock, SharedCommitLock
 from magic_server.store.committing import SubmapCommits
 from magic_server.store.database import Database
@@ -44,6 +46,8 @@ from magic_server.store_config import StoreConfig
 from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
+_T = TypeVar("_T")
+_CACHE = "blob-cache"
 
 
 class Store:
@@ -57,8 +61,13 @@ class Store:
         partial_uploads: PartialUploadLimits | None = None,
         config: StoreConfig | None = None,
         replica: str = "",
+        observer: BlobObserver = lambda operation, outcome, seconds: None,
     ) -> None:
-        """`replica` names this server among those that share a PostgreSQL database."""
+        """`replica` names this server among those that share a PostgreSQL database.
+
+        `observer` hears of every request to a bucket.
+        """
+        place = bucket_place(config or StoreConfig(), cache=folder / _CACHE)
         engine = engine_of(config or StoreConfig(), folder)
         if config is not None and config.index == "pgvector" and not engine.shared:
             raise ConfigError.field(
@@ -68,13 +77,22 @@ class Store:
         self.folder = folder
         # What this server alone writes and reads.
         self.scratch = folder / "replicas" / replica if engine.shared else folder
-        self.blobs = SharedBlobFolder(folder, self.scratch) if engine.shared else BlobFolder(folder)
+        self._bucket: BucketBlobs | None = None
+        self.blobs: BlobStore
+        if place is not None:
+            server = replica if engine.shared else ""
+            self.blobs = self._bucket = BucketBlobs(place, server=server, observer=observer)
+        elif engine.shared:
+            self.blobs = SharedBlobFolder(folder, self.scratch)
+        else:
+            self.blobs = BlobFolder(folder)
         self.uploads = UploadFolder(self.scratch)
         self._threads = threads
         self._partial_uploads = partial_uploads or PartialUploadLimits()
         self._database = Database(engine)
         self._commit_lock = SharedCommitLock(self._database) if engine.shared else CommitLock()
         self._lock_files: list[int] = []
+        self._identity = ""
         pgvector = config is not None and config.index == "pgvector"
         self._descriptors = DescriptorTable(self._database) if pgvector else None
         # Which sessions this server works on; None where it has all of them.
@@ -113,23 +131,41 @@ class Store:
         else:
             self._lock_files.append(ownership.lock(self.scratch))
         await self._database.open(first=self._require_database)
+        if self._bucket is not None:
+            await self._in_thread(self._bucket.mark, self._identity)
         if self._descriptors is not None:
             await self._descriptors.open()
-        loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._threads, self._open_folders)
-        removed = await self.collect_orphans()
+        await self._in_thread(self._open_folders)
+        # A large bucket takes minutes to go through: there the upkeep does it.
+        removed = 0 if self.blobs.far else await self.collect_orphans()
         if removed:
             logger.info("removed %d blobs that nothing referred to", removed)
 
     async def _require_database(self, connection: AsyncConnection) -> None:
-        """Raise WrongState unless folder and database belong together; while nobody else can."""
-        if self.leases is None:
-            return
+        """Raise WrongState unless blobs and database belong together; while nobody else can."""
         found = await connection.scalar(sa.select(identity.c.id))
-        new = found or uuid.uuid4().hex
-        ownership.require_database(self.folder, new, is_new=found is None)
+        if self._bucket is None and self.leases is None:
+            await self._require_folder(connection, found)
+            return
+        self._identity = found or uuid.uuid4().hex
+        if self._bucket is None:
+            ownership.require_database(self.folder, self._identity, is_new=found is None)
+        else:
+            if self.leases is not None:
+                ownership.require_no_sqlite(self.folder)
+            require, new = self._bucket.require, not await _refers_to_blobs(connection)
+            await self._in_thread(lambda: require(self._identity, may_be_new=new))
         if found is None:
-            await connection.execute(sa.insert(identity), {"id": new})
+            await connection.execute(sa.insert(identity), {"id": self._identity})
+
+    async def _require_folder(self, connection: AsyncConnection, found: str | None) -> None:
+        """Raise WrongState where the blobs of a SQLite database are in a bucket."""
+        if found is not None and await _refers_to_blobs(connection):
+            raise WrongState(
+                f"the blobs of {self.folder} are in a bucket; give store.blobs as before, or "
+                "choose another data folder"
+            )
+        await connection.execute(sa.delete(identity))
 
     def _open_folders(self) -> None:
         self.blobs.open()
@@ -149,7 +185,7 @@ class Store:
         return PgvectorPlaces(self._descriptors, self._database, session)
 
     async def add_submap(
-        self, agent: AgentRow, submap: NewSubmap, written: Sequence[BlobWriter], *, now: float
+        self, agent: AgentRow, submap: NewSubmap, written: Sequence[WrittenBlob], *, now: float
     ) -> FirstAnswer | None:
         """Make a received sub-map durable: its blobs, then one transaction.
 
@@ -164,17 +200,17 @@ class Store:
         session: SessionRow,
         made: NewMap,
         *,
-        written: Sequence[BlobWriter],
+        written: Sequence[WrittenBlob],
         now: float,
     ) -> None:
         """Make a merged map durable and its operation done."""
-        loop = asyncio.get_running_loop()
+        await self.blobs.bring(written, self._threads)
         async with self._commit_lock:
-            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            fresh = await self._in_thread(self.blobs.adopt, written)
             try:
                 await self.maps.succeed(operation, session, made, now=now)
             except BaseException:
-                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                await asyncio.shield(self._in_thread(self.blobs.remove, fresh))
                 raise
 
     async def add_session(
@@ -183,32 +219,47 @@ class Store:
         submaps: Sequence[ImportedSubmap],
         asked: ImportRequest,
         *,
-        written: Sequence[BlobWriter],
+        written: Sequence[WrittenBlob],
     ) -> Imported:
         """Make a checked archive durable: all of its session, or nothing."""
-        loop = asyncio.get_running_loop()
+        await self.blobs.bring(written, self._threads)
         async with self._commit_lock:
-            fresh = await loop.run_in_executor(self._threads, self.blobs.adopt, written)
+            fresh = await self._in_thread(self.blobs.adopt, written)
             try:
                 imported = await self.archive.insert(archive, submaps, asked)
             except BaseException:
-                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                await asyncio.shield(self._in_thread(self.blobs.remove, fresh))
                 raise
             if imported.repeated:  # they are those of a session that was deleted since
-                await asyncio.shield(loop.run_in_executor(self._threads, self.blobs.remove, fresh))
+                await asyncio.shield(self._in_thread(self.blobs.remove, fresh))
             return imported
 
     async def collect_orphans(self) -> int:
         """Remove blobs that no sub-map and no map refers to; returns how many."""
-        loop = asyncio.get_running_loop()
+        # Nobody can add anything meanwhile: a large bucket is gone through part by part.
+        return sum([await self._collect(shard) for shard in self.blobs.shards])
+
+    async def _collect(self, shard: str) -> int:
         async with self._commit_lock.alone():
+            used: set[str] = set()
             async with self._database.read() as connection:
-                used = set(await connection.scalars(sa.select(submap_blobs.c.sha256).distinct()))
-                used |= set(await connection.scalars(sa.select(map_files.c.sha256).distinct()))
+                for digest in (submap_blobs.c.sha256, map_files.c.sha256):
+                    query = sa.select(digest).distinct().where(digest.startswith(shard))
+                    used |= set(await connection.scalars(query))
 
             def remove() -> int:
-                orphans = [name for name in self.blobs.names() if name not in used]
+                orphans = [name for name in self.blobs.names(shard) if name not in used]
                 self.blobs.remove(orphans)
                 return len(orphans)
 
-            return await loop.run_in_executor(self._threads, remove)
+            return await self._in_thread(remove)
+
+    async def _in_thread(self, function: Callable[..., _T], *arguments: Any) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+async def _refers_to_blobs(connection: AsyncConnection) -> bool:
+    for table in (submap_blobs, map_files):
+        if await connection.scalar(sa.select(table.c.sha256).limit(1)) is not None:
+            return True
+    return False

@@ -13,7 +13,7 @@ from magic_core.errors import NotFound
 from magic_core.submap import Descriptor, OdometryEdge
 from magic_core.wire import names, records
 from magic_core.wire.convert import moment
-from magic_server.store.blobs import BlobFolder
+from magic_server.store.blob_store import BlobStore
 from magic_server.store.database import Database
 from magic_server.store.rows import (
     AgentRow,
@@ -69,7 +69,7 @@ class Arrival:
 class SubmapTable:
     """Sub-maps, their headers and which blobs they hold."""
 
-    def __init__(self, database: Database, blobs: BlobFolder) -> None:
+    def __init__(self, database: Database, blobs: BlobStore) -> None:
         self._database = database
         self._blobs = blobs
 
@@ -114,7 +114,7 @@ class SubmapTable:
         return None
 
     async def stored(self, session: SessionRow, agent: str, index: int) -> StoredSubmap:
-        """A sub-map's header and blob paths; NotFound when it is not stored."""
+        """A sub-map's header and blobs; NotFound when it is not stored."""
         name = names.submap_name(session.name, agent, index)
         query = sa.select(submaps.c.id, submaps.c.header).join(agents)
         query = query.where(_is(session, agent, index))
@@ -124,8 +124,8 @@ class SubmapTable:
                 raise NotFound(f"{name} is not stored")
             digests = sa.select(submap_blobs.c.sha256).where(submap_blobs.c.submap_id == row.id)
             found = await connection.scalars(digests.order_by(submap_blobs.c.position))
-            paths = tuple(self._blobs.path(sha256) for sha256 in found)
-        return StoredSubmap(row.header, paths)
+            blobs = tuple(self._blobs.blob(sha256) for sha256 in found)
+        return StoredSubmap(row.header, blobs)
 
     async def vertices(self, session: SessionRow) -> list[Vertex]:
         """Every sub-map of a session as the pose graph needs it, in order of arrival."""

@@ -125,7 +125,7 @@ async def test_a_submap_is_found_again_by_another_store(tmp_path: Path) -> None:
             stored = await store.submaps.stored(session, "agent_0", 1)
             encoded = encode_submap(submaps[1], request_id="r")
             assert stored.header == encoded.header.SerializeToString()
-            assert [path.read_bytes() for path in stored.blobs] == list(encoded.blobs)
+            assert [blob.read() for blob in stored.blobs] == list(encoded.blobs)
 
 
 async def test_blobs_without_a_transaction_are_removed_at_the_next_start(tmp_path: Path) -> None:
