@@ -17,7 +17,7 @@ _IDENTITY_ROW = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 _MEDIA_TYPES = {
     submap_pb2.BLOB_ROLE_GAUSSIANS: ("application/vnd.magicslam.gaussians",),
     submap_pb2.BLOB_ROLE_COLOUR: images.COLOUR_MEDIA_TYPES,
-    submap_pb2.BLOB_ROLE_DEPTH: (images.PNG,),
+    submap_pb2.BLOB_ROLE_DEPTH: images.DEPTH_MEDIA_TYPES,
 }
 
 

@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.errors import CorruptData, InvalidInput
+from magic_core.wire import depth_planes
 
 JPEG, PNG = "image/jpeg", "image/png"
+DEPTH_PLANES = depth_planes.MEDIA_TYPE
 COLOUR_MEDIA_TYPES = (JPEG, PNG)
+DEPTH_MEDIA_TYPES = (DEPTH_PLANES, PNG)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _STANDALONE_MARKERS = frozenset((0x01, *range(0xD0, 0xD8)))
@@ -47,12 +50,16 @@ def encode_colour_png(colour: NDArray[np.uint8]) -> bytes:
     return _encode(".png", _bgr(colour), [cv2.IMWRITE_PNG_COMPRESSION, 3])
 
 
+def encode_depth(depth: NDArray[np.float32], *, metres_per_unit: float = 0.001) -> bytes:
+    """(h, w) depth in metres in planes; what does not fit 16 bits becomes "no reading"."""
+    return depth_planes.encode(_in_units(depth, metres_per_unit))
+
+
 def encode_depth_png(depth: NDArray[np.float32], *, metres_per_unit: float = 0.001) -> bytes:
     """(h, w) depth in metres as 16-bit grey PNG; what does not fit 16 bits becomes "no reading"."""
-    units = np.rint(np.nan_to_num(depth, posinf=0.0, neginf=0.0) / metres_per_unit)
-    units = np.where((units >= 0) & (units <= 65535), units, 0).astype(np.uint16)
     # One filter for all rows: the usual choice row by row looks at bytes, not at 16-bit values.
     filtered = [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+    units = _in_units(depth, metres_per_unit)
     return _encode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 6, *filtered])
 
 
@@ -66,11 +73,16 @@ def decode_colour(data: bytes, media_type: str, *, size: tuple[int, int]) -> NDA
 
 
 def decode_depth(
-    data: bytes, *, metres_per_unit: float, size: tuple[int, int]
+    data: bytes, media_type: str, *, metres_per_unit: float, size: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """(h, w) depth in metres of a 16-bit grey PNG of `size` = (width, height) pixels."""
-    _require(read_header(data, PNG), size, bits=16, channels=(1,), what="depth image")
-    return _decode(data, cv2.IMREAD_UNCHANGED, PNG).astype(np.float32) * np.float32(metres_per_unit)
+    """(h, w) depth in metres of an image in planes, or a 16-bit grey PNG, of `size` = (width,
+    height) pixels."""
+    _require(read_header(data, media_type), size, bits=16, channels=(1,), what="depth image")
+    if media_type == DEPTH_PLANES:
+        units = depth_planes.decode(data)
+    else:
+        units = _decode(data, cv2.IMREAD_UNCHANGED, media_type)
+    return units.astype(np.float32) * np.float32(metres_per_unit)
 
 
 def read_header(data: bytes, media_type: str) -> ImageHeader:
@@ -79,13 +91,16 @@ def read_header(data: bytes, media_type: str) -> ImageHeader:
         return _png_header(data)
     if media_type == JPEG:
         return _jpeg_header(data)
-    raise InvalidInput.field("media_type", f"{media_type!r}, expected {JPEG} or {PNG}")
+    if media_type == DEPTH_PLANES:
+        return ImageHeader(*depth_planes.read_size(data), bits=16, channels=1)
+    expected = f"expected {JPEG}, {PNG} or {DEPTH_PLANES}"
+    raise InvalidInput.field("media_type", f"{media_type!r}, {expected}")
 
 
 def check_image(data: bytes, media_type: str, *, size: tuple[int, int], depth: bool) -> None:
     """Raise unless the bytes decode to an image of the right kind and (width, height)."""
     if depth:
-        decode_depth(data, metres_per_unit=1.0, size=size)
+        decode_depth(data, media_type, metres_per_unit=1.0, size=size)
     else:
         decode_colour(data, media_type, size=size)
 
@@ -148,6 +163,11 @@ def _require(
             f"{what} has {header.channels} channels of {header.bits} bits, "
             f"expected {channels[0]} of {bits}"
         )
+
+
+def _in_units(depth: NDArray[np.float32], metres_per_unit: float) -> NDArray[np.uint16]:
+    units = np.rint(np.nan_to_num(depth, posinf=0.0, neginf=0.0) / metres_per_unit)
+    return np.where((units >= 0) & (units <= 65535), units, 0).astype(np.uint16)
 
 
 def _bgr(colour: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -72,13 +72,13 @@ def encode_submap(
     for keyframe in submap.keyframes:
         colour, media_type = _encode_colour(keyframe, encoding)
         unit = encoding.metres_per_unit
-        depth = images.encode_depth_png(keyframe.depth, metres_per_unit=unit)
+        depth = images.encode_depth(keyframe.depth, metres_per_unit=unit)
         header.keyframes.add(
             frame_index=keyframe.frame_index,
             timestamp_s=keyframe.timestamp_s,
             anchor_from_camera=geometry.pose_to_proto(keyframe.anchor_from_camera),
             colour_blob=blobs.add(colour, submap_pb2.BLOB_ROLE_COLOUR, media_type),
-            depth_blob=blobs.add(depth, submap_pb2.BLOB_ROLE_DEPTH, images.PNG, unit),
+            depth_blob=blobs.add(depth, submap_pb2.BLOB_ROLE_DEPTH, images.DEPTH_PLANES, unit),
         )
     header.blobs.extend(blobs.infos)
     return EncodedSubmap(header, tuple(blobs.data))
@@ -189,7 +189,10 @@ def _keyframe_from_proto(
         anchor_from_camera=geometry.pose_from_proto(message.anchor_from_camera),
         colour=images.decode_colour(blobs[message.colour_blob], colour_info.media_type, size=size),
         depth=images.decode_depth(
-            blobs[message.depth_blob], metres_per_unit=depth_info.metres_per_unit, size=size
+            blobs[message.depth_blob],
+            depth_info.media_type,
+            metres_per_unit=depth_info.metres_per_unit,
+            size=size,
         ),
     )
 

@@ -255,7 +255,7 @@ def _query_view(image: QueryImage) -> AnchorView:
     size = (image.camera.width, image.camera.height)
     colour = images.decode_colour(image.colour, image.colour_media_type, size=size)
     unit = image.metres_per_unit
-    depth = images.decode_depth(image.depth_png, metres_per_unit=unit, size=size)
+    depth = images.decode_depth(image.depth_png, images.PNG, metres_per_unit=unit, size=size)
     return AnchorView(camera=image.camera, colour=colour, depth=depth)
 
 
@@ -294,6 +294,7 @@ def _images(
     )
     depth = images.decode_depth(
         stored.blobs[message.depth_blob].read(),
+        header.blobs[message.depth_blob].media_type,
         metres_per_unit=header.blobs[message.depth_blob].metres_per_unit,
         size=size,
     )

@@ -9,7 +9,7 @@ import pytest
 
 from magic_core.errors import MagicError, ResourceExhausted
 from magic_core.gaussians import GaussianCloud, codec
-from tests.faults.mutations import mutated_gaussians
+from tests.faults.mutations import mutated_frame
 from tests.small_world import make_submap
 
 
@@ -36,7 +36,7 @@ def test_it_agrees_with_decoding_on_damaged_blobs() -> None:
     right = codec.encode_compact(make_submap().gaussians)
     refused = 0
     for _ in range(1500):
-        data = mutated_gaussians(right, rng)
+        data = mutated_frame(right, rng, header_bytes=12)
         with np.errstate(over="ignore"):
             expected = verdict(codec.decode, data)
         assert verdict(codec.check, data) == expected

@@ -17,6 +17,7 @@ from magic_core.wire import (
     check_header,
     decode_submap,
     encode_submap,
+    images,
 )
 from magic_core.wire.chunks import sha256
 from tests.small_world import DIMENSION, make_submap
@@ -232,10 +233,12 @@ def test_blobs_of_the_wrong_kind_are_corrupt_or_invalid() -> None:
 def test_a_colour_png_is_no_depth_image() -> None:
     encoding = SubmapEncoding.lossless()
     encoded = encode_submap(make_submap(), request_id="r", encoding=encoding)
+    encoded.header.blobs[2].media_type = "image/png"
     with pytest.raises(InvalidInput, match="channels"):
         check_blob(encoded.header, 2, encoded.blobs[1])
+    depth = images.encode_depth_png(make_submap().anchor.depth)
     with pytest.raises(InvalidInput, match="channels"):
-        check_blob(encoded.header, 1, encoded.blobs[2])
+        check_blob(encoded.header, 1, depth)
 
 
 def test_a_truncated_image_is_corrupt() -> None:

@@ -43,7 +43,7 @@ from magic_server.store import BlobFolder
 from tests.faults.mutations import (
     mutate_message,
     mutated_bytes,
-    mutated_gaussians,
+    mutated_frame,
     mutated_png,
 )
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
@@ -63,6 +63,7 @@ class Material:
     """The Gaussians in the other layout."""
     jpeg: bytes
     png: bytes
+    depth_png: bytes
     size: tuple[int, int]
     archive: archive_pb2.SessionArchive
     folder: BlobFolder
@@ -82,6 +83,7 @@ class Material:
             lossless=codec.encode_lossless(submap.gaussians),
             jpeg=images.encode_colour_jpeg(colour),
             png=images.encode_colour_png(colour),
+            depth_png=images.encode_depth_png(submap.anchor.depth),
             size=(submap.camera.width, submap.camera.height),
             archive=_archive(zero, encoded),
             folder=folder,
@@ -140,12 +142,18 @@ def _use(header: submap_pb2.SubmapHeader) -> None:
 def check_gaussians(material: Material, rng: random.Random) -> None:
     """A blob of Gaussians in either layout."""
     data = rng.choice((material.submap.blobs[0], material.lossless))
-    _check(material, 0, mutated_gaussians(data, rng))
+    _check(material, 0, mutated_frame(data, rng, header_bytes=12))
 
 
 def check_depth(material: Material, rng: random.Random) -> None:
-    """A depth image."""
-    _check(material, 2, mutated_png(material.submap.blobs[2], rng))
+    """A depth image as agents send it."""
+    _check(material, 2, mutated_frame(material.submap.blobs[2], rng, header_bytes=16))
+
+
+def check_depth_png(material: Material, rng: random.Random) -> None:
+    """A depth image as PNG."""
+    data = mutated_png(material.depth_png, rng)
+    images.check_image(data, images.PNG, size=material.size, depth=True)
 
 
 def check_jpeg(material: Material, rng: random.Random) -> None:
@@ -225,7 +233,8 @@ CHECKS: dict[str, Callable[[Material, random.Random], None]] = {
     "gaussians": check_gaussians,
     "header_bytes_2": check_header_bytes,
     "header_fields_2": check_header_fields,
-    "depth_png": check_depth,
+    "depth": check_depth,
+    "depth_png": check_depth_png,
     "jpeg": check_jpeg,
     "header_fields_3": check_header_fields,
     "png": check_png,

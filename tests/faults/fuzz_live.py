@@ -25,7 +25,7 @@ from magic_server.loops import LoopConfig
 from magic_server.quotas import QuotaConfig
 from magic_server.server import Server
 from tests.faults.fuzz_checks import LIMITS, Material, archive_file
-from tests.faults.mutations import mutate_message, mutated_bytes, mutated_gaussians
+from tests.faults.mutations import mutate_message, mutated_bytes, mutated_frame
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
 from tests.waiting import eventually
 
@@ -168,7 +168,7 @@ def _right_request(request: Message, material: Material) -> Message:
         "name": _name_for(request),
         "colour": material.jpeg,
         "colour_media_type": images.JPEG,
-        "depth_png": material.zero.blobs[2],
+        "depth_png": material.depth_png,
         "metres_per_unit": 0.001,
     }
     for field in request.DESCRIPTOR.fields:
@@ -207,6 +207,13 @@ def _upload(channel: grpc.aio.Channel, path: str, material: Material) -> Any:
     return call
 
 
+def _damaged(media_type: str, blob: bytes, rng: random.Random) -> bytes:
+    if media_type == images.JPEG:
+        return mutated_bytes(blob, rng)
+    header_bytes = 16 if media_type == images.DEPTH_PLANES else 12
+    return mutated_frame(blob, rng, header_bytes=header_bytes)
+
+
 def _damaged_upload(material: Material, rng: random.Random) -> list[Any]:
     """The messages of an upload with one thing wrong; length and digest of a blob are right."""
     blobs = list(material.submap.blobs)
@@ -215,8 +222,7 @@ def _damaged_upload(material: Material, rng: random.Random) -> list[Any]:
     header.request_id = f"fuzz {rng.random()}"
     if rng.random() < 0.4:
         at = rng.randrange(len(blobs))
-        change = mutated_gaussians if at == 0 else mutated_bytes
-        blobs[at] = change(blobs[at], rng)
+        blobs[at] = _damaged(header.blobs[at].media_type, blobs[at], rng)
         _describe(header.blobs[at], blobs[at])
     elif rng.random() < 0.6:
         mutate_message(header, rng)

@@ -128,11 +128,11 @@ def _value(field: FieldDescriptor, old, rng: random.Random):
     return rng.choice((*TEXTS, (old or "")[:-1], (old or "") + rng.choice("/.\0a")))
 
 
-def mutated_gaussians(data: bytes, rng: random.Random) -> bytes:
-    """A Gaussian blob with blind changes, or with a changed content in a whole frame."""
+def mutated_frame(data: bytes, rng: random.Random, *, header_bytes: int) -> bytes:
+    """A header and a zstd frame with blind changes, or with a changed content in a whole frame."""
     if rng.random() < 0.4:
         return mutated_bytes(data, rng)
-    content = bytearray(zstandard.ZstdDecompressor().decompress(data[12:]))
+    content = bytearray(zstandard.ZstdDecompressor().decompress(data[header_bytes:]))
     for _ in range(rng.choice((1, 1, 2, 5))):
         at = rng.choice((rng.randrange(len(content)), rng.randrange(min(48, len(content)))))
         if rng.random() < 0.5:
@@ -144,9 +144,9 @@ def mutated_gaussians(data: bytes, rng: random.Random) -> bytes:
             content[at // 4 * 4 : at // 4 * 4 + len(piece)] = piece
     if rng.random() < 0.3:
         content = content[: rng.randrange(len(content))]
-    header = bytearray(data[:12])
+    header = bytearray(data[:header_bytes])
     if rng.random() < 0.3:
-        header[4 + rng.randrange(8)] = rng.randrange(256)
+        header[4 + rng.randrange(header_bytes - 4)] = rng.randrange(256)
     return bytes(header) + zstandard.ZstdCompressor(level=1).compress(bytes(content))
 
 

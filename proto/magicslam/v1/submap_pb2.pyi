@@ -36,7 +36,9 @@ class _BlobRoleEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_BlobRole.Val
     BLOB_ROLE_COLOUR: _BlobRole.ValueType  # 2
     """A colour image, 8-bit RGB; media type image/jpeg or image/png."""
     BLOB_ROLE_DEPTH: _BlobRole.ValueType  # 3
-    """A depth image, 16-bit grey, 0 = no reading; media type image/png."""
+    """A depth image, 16-bit grey, 0 = no reading; media type application/vnd.magicslam.depth (see
+    docs/wire-format.md) or image/png.
+    """
 
 class BlobRole(_BlobRole, metaclass=_BlobRoleEnumTypeWrapper):
     """What a blob holds."""
@@ -48,7 +50,9 @@ BLOB_ROLE_GAUSSIANS: BlobRole.ValueType  # 1
 BLOB_ROLE_COLOUR: BlobRole.ValueType  # 2
 """A colour image, 8-bit RGB; media type image/jpeg or image/png."""
 BLOB_ROLE_DEPTH: BlobRole.ValueType  # 3
-"""A depth image, 16-bit grey, 0 = no reading; media type image/png."""
+"""A depth image, 16-bit grey, 0 = no reading; media type application/vnd.magicslam.depth (see
+docs/wire-format.md) or image/png.
+"""
 Global___BlobRole: _TypeAlias = BlobRole  # noqa: Y015
 
 @_typing.final
