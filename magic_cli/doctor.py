@@ -6,6 +6,7 @@ Examples:
   magic doctor
   magic doctor --warm        # compile all kernels now, so that the first run starts at once
   magic doctor --port 50061 --folder /srv/magic --json
+  magic doctor --blobs s3://robots/magic --s3-endpoint https://s3.example:9000
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from magic_cli.bucket_check import bucket
 from magic_cli.machine import Check, all_checks
 from magic_cli.options import parse
 from magic_cli.output import console, print_json, table
+from magic_server.store_config import StoreConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,12 @@ class DoctorConfig:
     """Image encoder to try instead of the default, as --places-model of `magic run`."""
     folder: Path = Path()
     """Where results would be written: its disk is checked."""
+    blobs: str = ""
+    """Bucket to try, as --store.blobs of `magic serve`."""
+    s3_endpoint: str = ""
+    """URL of its S3 server; empty for AWS."""
+    s3_region: str = ""
+    """Its region; empty for that of the environment."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -46,6 +55,11 @@ def main(arguments: list[str]) -> int:
         ):
             status.update(f"looking at {name}")
             checks.append(check())
+    if config.blobs:
+        store = StoreConfig(
+            blobs=config.blobs, s3_endpoint=config.s3_endpoint, s3_region=config.s3_region
+        )
+        checks.append(bucket(store))
     if config.warm:
         checks.append(_warm_up())
     colours = {"ok": "green", "warn": "yellow", "fail": "red"}

@@ -19,21 +19,16 @@ from magic_core.wire import geometry, names, records
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
-from magic_server.jobs.tasks import (
-    MergeOutcome,
-    MergeTask,
-    PlacedFiles,
-    merge_submaps,
-    read_progress,
-)
+from magic_server.jobs.delivery import Deliveries, Delivery, JobFile
+from magic_server.jobs.tasks import MergeOutcome, MergeTask, PlacedFiles, merge_submaps
 from magic_server.sessions import Sessions
 from magic_server.store import MapFile, NewMap, SessionRow, Store, WrittenBlob
 from magic_server.store.blobs import translated_disk_errors
+from magic_server.store.bucket import Delivered
 from magic_server.tasks import TaskScope
 
 logger = logging.getLogger(__name__)
 
-POLL_S = 0.25
 _COPY_BYTES = 1 << 20
 _MERGE_PREFIX = "merge-"
 
@@ -53,6 +48,7 @@ class GlobalMaps:
         self._store = store
         self._sessions = sessions
         self._jobs = jobs
+        self._deliveries = Deliveries(store, shares_folder=jobs.shares_folder)
         self._threads = threads
         self._config = config
         self._tasks = TaskScope("global maps")
@@ -165,9 +161,10 @@ class GlobalMaps:
         chosen = chosen_poses(snapshot, request.component)
         folder = self._folder_of(operation)
         await self._in_thread(lambda: folder.mkdir(exist_ok=True))
+        delivery = self._deliveries.of(folder)
         try:
             try:
-                task = await self._task(coordinator, chosen, request, folder)
+                task = await self._task(coordinator, chosen, request, delivery)
                 outcome = await self._followed(operation, task)
             except Exception as error:
                 _require_all(coordinator, chosen, error)
@@ -175,6 +172,7 @@ class GlobalMaps:
             await self._keep(operation, session, snapshot.revision, chosen, outcome)
         finally:
             if not self._closing:  # a server that stops keeps what it has, to go on from there
+                await asyncio.shield(self._in_thread(delivery.clear))
                 await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
 
     def _folder_of(self, operation: int) -> Path:
@@ -185,7 +183,7 @@ class GlobalMaps:
         coordinator: SessionCoordinator,
         chosen: list[mapping_pb.CorrectedPose],
         request: map_pb.BuildGlobalMapRequest,
-        folder: Path,
+        delivery: Delivery,
     ) -> MergeTask:
         placed = []
         for pose in chosen:
@@ -196,7 +194,7 @@ class GlobalMaps:
         config = self._config.merge
         if request.coarse_only:
             config = dataclasses.replace(config, refine=False, fill=False)
-        return MergeTask(tuple(placed), config, self._config.jobs.merge_threads, folder)
+        return MergeTask(tuple(placed), config, self._config.jobs.merge_threads, delivery)
 
     async def _followed(self, operation: int, task: MergeTask) -> MergeOutcome:
         """Run the merge and store its progress while it goes on."""
@@ -205,8 +203,8 @@ class GlobalMaps:
         last = None
         try:
             while not job.done():
-                await asyncio.wait([job], timeout=POLL_S)
-                progress = await self._in_thread(read_progress, task.folder)
+                await asyncio.wait([job], timeout=self._deliveries.poll_s)
+                progress = await self._in_thread(task.delivery.progress)
                 if progress is not None and progress != last:
                     last = progress
                     await self._advance(operation, "RUNNING", *progress)
@@ -222,7 +220,7 @@ class GlobalMaps:
         chosen: list[mapping_pb.CorrectedPose],
         outcome: MergeOutcome,
     ) -> None:
-        paths: dict[records.MapFormat, Path] = {
+        paths: dict[records.MapFormat, JobFile] = {
             "ply": outcome.ply,
             "lossless": outcome.lossless,
             "compact": outcome.compact,
@@ -243,8 +241,10 @@ class GlobalMaps:
         now = time.time()
         await self._store.add_map(operation, session, made, written=written, now=now)
 
-    def _copied(self, path: Path) -> WrittenBlob:
+    def _copied(self, path: JobFile) -> WrittenBlob:
         """A file of a merge as a blob that is ready to be adopted."""
+        if isinstance(path, Delivered):
+            return self._deliveries.adoptable(path)
         blob = self._store.blobs.writer()
         with path.open("rb") as file:
             while piece := file.read(_COPY_BYTES):

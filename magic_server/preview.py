@@ -16,7 +16,6 @@ import zlib
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from pathlib import Path
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import submap_pb2
@@ -26,6 +25,7 @@ from magic_core.wire import MAX_CHUNK_BYTES, geometry, names, records
 from magic_core.wire.convert import moment
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
+from magic_server.jobs.delivery import Deliveries, Delivery, FolderDelivery, JobFile, OpenFile
 from magic_server.jobs.tasks import PlacedFiles, PreviewTask, append_submaps
 from magic_server.preview_config import PreviewConfig
 from magic_server.sessions import Sessions
@@ -45,11 +45,15 @@ class _Preview:
     """The last preview of a session."""
 
     info: records.GlobalMapInfo
-    files: dict[records.MapFormat, tuple[Path, str, int]]
-    """Path, SHA-256 in hex and length of each format that was asked for."""
+    files: dict[records.MapFormat, tuple[JobFile, str, int]]
+    """The file, its SHA-256 in hex and its length for each format that was asked for."""
+    delivery: Delivery
     took_s: float
     made_at: float
     """Monotonic clock."""
+    readers: int = 0
+    replaced: bool = False
+    """Whether it goes with its last reader."""
 
 
 class Previews:
@@ -67,6 +71,7 @@ class Previews:
         self._store, self._sessions = store, sessions
         self._jobs, self._threads, self._config = jobs, threads, config
         self._root = store.scratch / _FOLDER
+        self._deliveries = Deliveries(store, shares_folder=jobs.shares_folder)
         self._last: dict[int, _Preview] = {}
         self._locks: dict[int, asyncio.Lock] = {}
         self._seen: dict[int, int] = {}
@@ -97,9 +102,9 @@ class Previews:
         last = self._last.get(row.id)
         if last is None or kind not in last.files:
             last = await self._made(coordinator, kind)
-        path, sha256, length = last.files[kind]
-        file = await self._in_thread(path.open, "rb")  # a newer preview leaves this one readable
-        return last.info, sha256, length, self._chunks(file)
+        made, sha256, length = last.files[kind]
+        file = await self._in_thread(self._deliveries.opened, made)
+        return last.info, sha256, length, self._chunks(last, file)
 
     async def _follow(self) -> None:
         """Build anew whatever session's pose graph has changed, one after another."""
@@ -148,9 +153,9 @@ class Previews:
             snapshot = coordinator.board.snapshot
             chosen = _largest(snapshot)
             folder = self._root / str(session.id) / f"{snapshot.revision}-{time.monotonic_ns()}"
-            task = PreviewTask(
-                await self._placed(coordinator, chosen), tuple(sorted(kinds)), folder
-            )
+            delivery = self._deliveries.of(folder)
+            placed = await self._placed(coordinator, chosen)
+            task = PreviewTask(placed, tuple(sorted(kinds)), delivery)
             outcome = await self._jobs.run(append_submaps, task)
             info = records.GlobalMapInfo(
                 name=names.map_name(session.name, PREVIEW_ID),
@@ -161,11 +166,11 @@ class Previews:
                 created_at=moment(time.time()),
             )
             now = time.monotonic()
-            made = _Preview(info, dict(outcome.files), took_s=now - started, made_at=now)
+            files, took_s = dict(outcome.files), now - started
+            made = _Preview(info, files, delivery, took_s=took_s, made_at=now)
             self._last[session.id] = made
             if last is not None:
-                older = next(iter(last.files.values()))[0].parent
-                await self._in_thread(shutil.rmtree, older, True)
+                await self._replace(last)
             return made
 
     async def _placed(
@@ -193,16 +198,27 @@ class Previews:
             await self._forget(session)
 
     async def _forget(self, session: int) -> None:
-        self._last.pop(session, None)
+        if (last := self._last.pop(session, None)) is not None:
+            await self._replace(last)
         await self._in_thread(shutil.rmtree, self._root / str(session), True)
 
-    async def _chunks(self, file) -> AsyncIterator[submap_pb2.BlobChunk]:
+    async def _replace(self, preview: _Preview) -> None:
+        """Remove what nobody will ask for again, once nobody reads it."""
+        preview.replaced = True
+        if isinstance(preview.delivery, FolderDelivery) or not preview.readers:
+            # An open file stays readable; an object does not.
+            await self._in_thread(preview.delivery.clear)
+
+    async def _chunks(
+        self, preview: _Preview, file: OpenFile
+    ) -> AsyncIterator[submap_pb2.BlobChunk]:
         def piece(offset: int) -> submap_pb2.BlobChunk | None:
             data = file.read(MAX_CHUNK_BYTES)
             if not data:
                 return None
             return submap_pb2.BlobChunk(offset=offset, data=data, crc32=zlib.crc32(data))
 
+        preview.readers += 1
         try:
             offset = 0
             while (chunk := await self._in_thread(piece, offset)) is not None:
@@ -210,6 +226,9 @@ class Previews:
                 offset += len(chunk.data)
         finally:
             file.close()
+            preview.readers -= 1
+            if preview.replaced and not preview.readers:
+                await asyncio.shield(self._in_thread(preview.delivery.clear))
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

@@ -49,6 +49,7 @@ from magic_server.servicers import GlobalMapServicer, MappingServicer, SessionSe
 from magic_server.sessions import Sessions
 from magic_server.signals import stop_signals
 from magic_server.store import Store
+from magic_server.store.bucket import bucket_of
 from magic_server.tls import server_credentials
 from magic_server.upkeep import Upkeep
 
@@ -85,6 +86,7 @@ class Server:
             folder=config.data_dir,
             trace=config.tracing,
             observer=self.metrics.job_done,
+            bucket=bucket_of(config.store, config.data_dir),
         )
         self._store = Store(
             config.data_dir,

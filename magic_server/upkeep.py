@@ -7,6 +7,7 @@ import logging
 import time
 from concurrent.futures import Executor
 
+from magic_core.errors import Unavailable
 from magic_server.store import Store
 from magic_server.tasks import TaskScope
 
@@ -44,6 +45,9 @@ class Upkeep:
             wait = True
             try:
                 blobs, uploads = await self.tidy()
+            except Unavailable as error:
+                logger.warning("not tidied: %s; tried again in %g s", error, self._interval_s)
+                continue
             except Exception:
                 logger.exception("tidying failed; it is tried again in %g s", self._interval_s)
                 continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import random
 import socket
 import urllib.request
 import uuid
@@ -30,8 +31,10 @@ ENVIRONMENT = {
 class BucketServer:
     """An S3 server on a port of its own; its buckets stay while it is stopped."""
 
+    key, secret = KEY, SECRET
+
     def __init__(self) -> None:
-        self.port = _free_port()
+        self.port = free_port()
         self.endpoint = f"http://127.0.0.1:{self.port}"
         self._server: ThreadedMotoServer | None = None
 
@@ -77,7 +80,7 @@ class BucketServer:
         import s3fs
 
         return s3fs.S3FileSystem(
-            key=KEY, secret=SECRET, endpoint_url=self.endpoint, use_listings_cache=False,
+            key=self.key, secret=self.secret, endpoint_url=self.endpoint, use_listings_cache=False,
             skip_instance_cache=True,
         )  # fmt: skip
 
@@ -109,7 +112,13 @@ def bucket_server() -> Iterator[BucketServer]:
         server.stop()
 
 
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+def free_port() -> int:
+    """A TCP port that nobody listens on, and that the system gives to nobody who asks for any."""
+    while True:
+        port = random.SystemRandom().randrange(10_000, 30_000)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from concurrent.futures import Executor
@@ -42,12 +43,13 @@ class Archives:
     async def export(self, session: str) -> AsyncIterator[bytes]:
         """The archive of a session, by its id, in pieces of at most a megabyte.
 
-        Raises NotFound without it, and when something of it is deleted meanwhile.
+        Raises NotFound without it, and when something of it is deleted meanwhile, CorruptData when
+        a blob is not what it was.
         """
         rows = await self._store.archive.rows(session)
-        archive, digests = await self._in_thread(archive_of, rows)
+        archive, lengths = await self._in_thread(archive_of, rows)
         data = await self._in_thread(archive.SerializeToString)
-        blobs = await self._in_thread(self._members, digests)
+        blobs = [Member(layout.blob_path(key), length, key) for key, length in lengths.items()]
         members = [Member(layout.SESSION, len(data), sha256(data).hex()), *blobs]
         if len(data) > layout.MAX_SESSION_BYTES:
             raise ResourceExhausted(f"sessions/{session} is too large for one archive")
@@ -113,22 +115,20 @@ class Archives:
             await on_stored(names.parse_session(asked.name))
         return added.session
 
-    def _members(self, digests: list[str]) -> list[Member]:
-        return [
-            Member(layout.blob_path(digest), self._store.blobs.total_bytes([digest]), digest)
-            for digest in digests
-        ]
-
     async def _pieces(self, member: Member) -> AsyncIterator[bytes]:
-        offset = 0
+        offset, digest = 0, hashlib.sha256()
         while offset < member.length:
+            length = min(PIECE_BYTES, member.length - offset)
             piece = await self._in_thread(
-                self._store.blobs.read_piece, member.sha256, offset, PIECE_BYTES
+                self._store.blobs.read_piece, member.sha256, offset, length
             )
             if not piece:
                 raise CorruptData(f"blob {member.sha256} is shorter than it was")
-            yield piece
+            await self._in_thread(digest.update, piece)
             offset += len(piece)
+            if offset == member.length and digest.hexdigest() != member.sha256:
+                raise CorruptData(self._store.blobs.damage(member.sha256))
+            yield piece
 
     async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

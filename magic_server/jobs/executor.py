@@ -52,6 +52,11 @@ class ProcessExecutor(CountedJobs):
         """How many jobs could run at once now."""
         return self._config.workers
 
+    @property
+    def shares_folder(self) -> bool:
+        """Its processes run on the server's machine."""
+        return True
+
     async def start(self) -> None:
         """Nothing: processes start with the first jobs."""
 
@@ -61,24 +66,36 @@ class ProcessExecutor(CountedJobs):
             pool = self._pool
             begun = time.perf_counter()
             try:
-                # Submitting may start a process, which takes longer than the event loop can spare.
-                future = await asyncio.to_thread(pool.submit, run_job, parent, function, *arguments)
-                done: JobDone[T] = await _result(future)
+                done: JobDone[T] = await self._done(pool, run_job, parent, function, *arguments)
                 waited_s = time.perf_counter() - begun - done.seconds
                 self._observer(name, "ok", max(0.0, waited_s), done.seconds)
                 return done.result
-            except BrokenProcessPool as error:
-                if self._closed:
-                    raise Unavailable("the server is stopping") from error
+            except BrokenProcessPool:
                 self._replace(pool)
                 logger.warning("a worker died during %s", name)
                 self._observer(name, "died", 0.0, 0.0)
                 if last:
-                    raise Unavailable(f"workers died twice during {name}") from error
+                    raise Unavailable(f"workers died twice during {name}") from None
             except Exception:
                 self._observer(name, "failed", 0.0, 0.0)
                 raise
         raise AssertionError("unreachable")
+
+    async def _done(self, pool: ProcessPoolExecutor, *call: Any) -> Any:
+        """What a worker answers; Unavailable when the pool ends first, however that shows."""
+        try:
+            # Submitting may start a process, which takes longer than the event loop can spare.
+            future = await asyncio.to_thread(_submitted, pool, *call)
+            return await asyncio.wrap_future(future)
+        except (BrokenProcessPool, _PoolEnded) as error:
+            if not self._closed:
+                raise
+            raise Unavailable("the server is stopping") from error
+        except asyncio.CancelledError as error:  # of the job where it was still waiting
+            task = asyncio.current_task()
+            if not self._closed or task is None or task.cancelling():
+                raise
+            raise Unavailable("the server is stopping") from error
 
     async def close(self) -> None:
         """End the workers; jobs under way are lost."""
@@ -101,8 +118,17 @@ class ProcessExecutor(CountedJobs):
         broken.shutdown(wait=False)
 
 
-async def _result(future: Future[T]) -> T:
-    return await asyncio.wrap_future(future)
+class _PoolEnded(Exception):
+    """A pool was shut down before it took a job."""
+
+
+def _submitted(pool: ProcessPoolExecutor, *call: Any) -> Future[Any]:
+    try:
+        return pool.submit(*call)
+    except BrokenProcessPool:
+        raise
+    except RuntimeError as error:
+        raise _PoolEnded from error
 
 
 def _end(pool: ProcessPoolExecutor) -> None:

@@ -1,7 +1,8 @@
 """What an engine for heavy work must do. The rest of the server knows no more of it than this.
 
 A job is a module-level function of this project and plain arguments: small arrays, messages as
-bytes, and paths of files under the server's data folder, which a worker reads and writes. It may
+bytes, stored blobs, and paths of files under the server's data folder, which a worker reads and
+writes where it shares that folder. It may
 run twice: an engine tries it again when a worker is lost, so that a job leaves nothing behind that
 a second try would stumble over.
 """
@@ -34,6 +35,11 @@ class JobExecutor(Protocol):
     @property
     def waiting(self) -> int:
         """Jobs that wait for a worker."""
+        ...
+
+    @property
+    def shares_folder(self) -> bool:
+        """Whether jobs read and write the server's data folder; else a bucket is all they share."""
         ...
 
     async def start(self) -> None:

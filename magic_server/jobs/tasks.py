@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from magic_core.errors import MagicError
 from magic_core.geometry import Camera
 from magic_core.wire import geometry, images
 from magic_server.jobs.attempt import Attempt, made_whole
+from magic_server.jobs.delivery import Delivery, FolderDelivery, JobFile, SpacedReports
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
@@ -99,18 +99,18 @@ class MergeTask:
     config: MergeConfig
     threads: int
     """Threads of the rasteriser; 0 for one per core."""
-    folder: Path
-    """A folder for the results, the progress file and what an interrupted merge left."""
+    delivery: Delivery
+    """For the results, the progress and, in a folder, what an interrupted merge left."""
 
 
 @dataclass(frozen=True, slots=True)
 class MergeOutcome:
-    """What a merge made: files in its folder."""
+    """What a merge made."""
 
     gaussian_count: int
-    ply: Path
-    lossless: Path
-    compact: Path
+    ply: JobFile
+    lossless: JobFile
+    compact: JobFile
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,16 +119,16 @@ class PreviewTask:
 
     submaps: tuple[PlacedFiles, ...]
     kinds: tuple[MapFormat, ...]
-    folder: Path
-    """A folder that does not exist yet, or that an earlier try at the same job made."""
+    delivery: Delivery
+    """A folder does not exist yet, or an earlier try at the same job made it."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreviewOutcome:
-    """A preview's files: path, SHA-256 in hex and length by format."""
+    """A preview's files: the file, its SHA-256 in hex and its length by format."""
 
     gaussian_count: int
-    files: tuple[tuple[MapFormat, tuple[Path, str, int]], ...]
+    files: tuple[tuple[MapFormat, tuple[JobFile, str, int]], ...]
 
 
 def append_submaps(task: PreviewTask) -> PreviewOutcome:
@@ -149,15 +149,19 @@ def append_submaps(task: PreviewTask) -> PreviewOutcome:
         "compact": stream.write_compact_pieces,
     }
     files = []
-    with made_whole(task.folder) as partial:
-        for kind in task.kinds:
-            path = partial / kind
-            write[kind](path, pieces)
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            files.append((kind, (task.folder / kind, digest, path.stat().st_size)))
+    with task.delivery.working() as work:
+        # A folder of the server's is there as a whole or not at all.
+        folder = work if isinstance(task.delivery, FolderDelivery) else work / "preview"
+        with made_whole(folder) as partial:
+            for kind in task.kinds:
+                path = partial / kind
+                write[kind](path, pieces)
+                with path.open("rb") as file:
+                    digest = hashlib.file_digest(file, "sha256").hexdigest()
+                files.append((kind, folder / kind, digest, path.stat().st_size))
+        delivered = [(kind, (task.delivery.deliver(p), d, n)) for kind, p, d, n in files]
     count = sum(source.gaussian_count() for source in sources)
-    return PreviewOutcome(count, tuple(files))
+    return PreviewOutcome(count, tuple(delivered))
 
 
 def verify_loop(
@@ -203,42 +207,42 @@ def solve_pose_graph(graph: GraphArrays, config: PoseGraphConfig) -> ArraySoluti
 def merge_submaps(task: MergeTask) -> MergeOutcome:
     """Merge placed sub-maps and write the map in every format.
 
-    One block of the map is in memory at a time. A folder that an interrupted merge of the same
-    sub-maps left is taken up where it was.
+    One block of the map is in memory at a time. A folder of the server's that an interrupted merge
+    of the same sub-maps left is taken up where it was.
     """
+    with task.delivery.working() as folder:
+        return _merged(task, folder)
+
+
+def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
     threads = task.threads or os.cpu_count() or 1
     os.environ["MAGIC_THREADS"] = str(threads)
     from magic_core.gaussians import stream
     from magic_server.globalmap.merge import merge_into
 
-    attempt = Attempt(task.folder)
+    attempt, tell = Attempt(folder), SpacedReports(task.delivery)
+
+    def report(share: float, stage: str) -> None:
+        attempt.report(share, stage)
+        tell(share, stage)
+
     config = task.config
     if not config.threads:
         config = dataclasses.replace(config, threads=threads)
     sources = [StoredSource.of(item) for item in task.submaps]
-    parts, summary = merge_into(task.folder, sources, config, progress=attempt.report)
-    outcome = MergeOutcome(
-        summary.gaussians,
-        *(task.folder / name for name in ("map.ply", "map.lossless", "map.compact")),
-    )
+    parts, summary = merge_into(folder, sources, config, progress=report)
     pieces = functools.partial(parts.clouds, summary.blocks)
-    for path, write in (
-        (outcome.ply, stream.write_ply_pieces),
-        (outcome.lossless, stream.write_lossless_pieces),
-        (outcome.compact, stream.write_compact_pieces),
+    made = []
+    for name, write in (
+        ("map.ply", stream.write_ply_pieces),
+        ("map.lossless", stream.write_lossless_pieces),
+        ("map.compact", stream.write_compact_pieces),
     ):
+        path = folder / name
         with attempt.file(path) as partial:
             write(partial, pieces)
-    return outcome
-
-
-def read_progress(folder: Path) -> tuple[float, str] | None:
-    """(share done, stage) that a merge last reported into its folder, or None."""
-    try:
-        share, stage = json.loads((folder / "progress.json").read_text())
-    except (FileNotFoundError, ValueError):
-        return None
-    return float(share), str(stage)
+        made.append(task.delivery.deliver(path))
+    return MergeOutcome(summary.gaussians, *made)
 
 
 @functools.lru_cache(maxsize=16)

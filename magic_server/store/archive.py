@@ -141,20 +141,20 @@ class ArchiveTable:
             return Imported(answer, repeated=False)
 
 
-def archive_of(rows: SessionRows) -> tuple[archive_pb2.SessionArchive, list[str]]:
-    """A session's message, and the digests of its blobs, each once, in order of first use."""
+def archive_of(rows: SessionRows) -> tuple[archive_pb2.SessionArchive, dict[str, int]]:
+    """A session's message, and the length of each of its blobs by digest, in order of first use."""
     name = rows.session.name
-    digests: dict[str, None] = {}
+    lengths: dict[str, int] = {}
     archive = archive_pb2.SessionArchive()
     for row in rows.submaps:
         entry = archive.submaps.add(searched=row.searched)
         entry.header.ParseFromString(row.header)
         entry.received_at.CopyFrom(_moment(row.received_at))
-        digests.update((blob.sha256.hex(), None) for blob in entry.header.blobs)
+        lengths.update((blob.sha256.hex(), blob.length) for blob in entry.header.blobs)
     files: dict[int, list[sa.Row]] = {}
     for row in rows.map_files:
         files.setdefault(row.map_id, []).append(row)
-        digests[row.sha256] = None
+        lengths[row.sha256] = row.length
     for row in rows.maps:
         _add_map(archive, name, row, files.get(row.id, []))
     for row in rows.removed:
@@ -173,7 +173,7 @@ def archive_of(rows: SessionRows) -> tuple[archive_pb2.SessionArchive, list[str]
     session.stored_bytes = sum(row.stored_bytes for row in rows.submaps)
     session.revision = archive.snapshot.revision
     session.pending_loops = sum(row.verdict == "PENDING" for row in rows.loops)
-    return archive, list(digests)
+    return archive, lengths
 
 
 def _agents(rows: SessionRows):

@@ -44,6 +44,7 @@ _LOOKED_UP = 256
 """Blobs whose lengths are asked for one by one; more are found in lists."""
 _ABANDONED = timedelta(days=1)
 _ID_KEY = "database-id"
+_CACHE = "blob-cache"
 _INVALID_RANGE = ("InvalidRange", "416")
 
 
@@ -109,7 +110,7 @@ class StagedBlob:
 
     def content(self) -> bytes:
         """All of a finished one, checked."""
-        data = _whole(self._client, self.key)
+        data = whole(self._client, self.key)
         if hashlib.sha256(data).hexdigest() != self.sha256:
             raise CorruptData(f"s3://{self._client.place.path(self.key)} was changed by somebody")
         return data
@@ -137,6 +138,55 @@ class StagedBlob:
             self._seconds += time.perf_counter() - begun
 
 
+@dataclass(frozen=True, slots=True)
+class Delivered:
+    """A file that a job left in the bucket."""
+
+    key: str
+    sha256: str
+    length: int
+
+
+class DeliveredBlob(StagedBlob):
+    """Such a file as a blob for the store to adopt."""
+
+    def __init__(self, client: BucketClient, file: Delivered) -> None:
+        self.key, self.length = file.key, file.length
+        self._client, self._sha256 = client, file.sha256
+        self._there = True
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the content, in hex."""
+        return self._sha256
+
+    def write(self, data: bytes) -> None:
+        """It is whole already."""
+        raise WrongState(f"{self.key} is whole")
+
+    def finish(self) -> None:
+        """Nothing: it is whole already."""
+
+    def discard(self) -> None:
+        """Nothing: whoever asked for the job removes what it left."""
+
+
+class DeliveredReader:
+    """Reads such a file from its beginning, as an open file is read."""
+
+    def __init__(self, client: BucketClient, file: Delivered) -> None:
+        self._client, self._key, self._offset = client, file.key, 0
+
+    def read(self, length: int) -> bytes:
+        """At most `length` further bytes; empty at the end."""
+        data = _read_piece(self._client, self._key, self._offset, length)
+        self._offset += len(data)
+        return data
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
 class BucketBlobs:
     """Objects named by the SHA-256 of their content. Several servers may share them.
 
@@ -161,7 +211,7 @@ class BucketBlobs:
     def open(self) -> None:
         """Drop what a dead server was writing. ConfigError or Unavailable without the bucket."""
         open_checked(self._client)
-        _delete(self._client, [key for key, _ in self._listed(self._incoming)])
+        delete(self._client, below=self._incoming)
         self._abort_uploads()
 
     def check(self) -> None:
@@ -175,6 +225,18 @@ class BucketBlobs:
     def writer(self) -> StagedBlob:
         """Begin a new blob."""
         return StagedBlob(self._client, f"{self._incoming}{uuid.uuid4().hex}")
+
+    def beginning_of(self, job: str) -> str:
+        """Of the keys that a job of this name may write; a start of the server removes them."""
+        return f"{self._incoming}{job}/"
+
+    def delivered(self, file: Delivered) -> DeliveredBlob:
+        """What a job left, for `adopt`."""
+        return DeliveredBlob(self._client, file)
+
+    def reader(self, file: Delivered) -> DeliveredReader:
+        """What a job left, to be read."""
+        return DeliveredReader(self._client, file)
 
     async def bring(self, written: Sequence[WrittenBlob], threads: Executor) -> None:
         """Upload what lies in the spool: nobody else's commit waits for it."""
@@ -206,12 +268,12 @@ class BucketBlobs:
         if len(wanted) <= _LOOKED_UP:
             return sum(filter(None, self._lengths(sorted(wanted))))
         shards = sorted({sha256[0] for sha256 in wanted})
-        listed = (pair for shard in shards for pair in self._listed(_shard(shard)))
-        return sum(length for key, length in listed if key.rpartition("/")[2] in wanted)
+        found = (pair for shard in shards for pair in listed(self._client, _shard(shard)))
+        return sum(length for key, length in found if key.rpartition("/")[2] in wanted)
 
     def names(self, shard: str = "") -> Iterator[str]:
         """The digest of every stored blob that begins like this."""
-        for key, _ in self._listed(_shard(shard)):
+        for key, _ in listed(self._client, _shard(shard)):
             yield key.rpartition("/")[2]
 
     def read(self, sha256: str) -> bytes:
@@ -250,7 +312,7 @@ class BucketBlobs:
 
     def _owner(self) -> str | None:
         try:
-            return _whole(self._client, _ID_KEY).decode("utf-8", "replace").strip()
+            return whole(self._client, _ID_KEY).decode("utf-8", "replace").strip()
         except NotFound:
             return None
 
@@ -272,28 +334,22 @@ class BucketBlobs:
         return self._client.run_all("head", [self._length(sha256) for sha256 in digests])
 
     async def _length(self, sha256: str) -> int | None:
+        # The first byte, not HEAD: some servers answer that for what is missing in a way that
+        # breaks the connection.
         key = self.place.key(_key(sha256))
         try:
             found = await self._client.files._call_s3(
-                "head_object", Bucket=self.place.bucket, Key=key
+                "get_object", Bucket=self.place.bucket, Key=key, Range="bytes=0-0"
             )
         except FileNotFoundError:
             return None
-        return int(found["ContentLength"])
-
-    def _listed(self, beginning: str) -> Iterator[tuple[str, int]]:
-        """Key, without the prefix, and length of every object below; a page in memory at a time."""
-        skip = len(self.place.key(""))
-        more: dict[str, str] = {}
-        while True:
-            page = self._client.call(
-                "list", "list_objects_v2", Prefix=self.place.key(beginning), **more
-            )
-            for entry in page.get("Contents", ()):
-                yield entry["Key"][skip:], int(entry["Size"])
-            if not page.get("IsTruncated"):
-                return
-            more = {"ContinuationToken": page["NextContinuationToken"]}
+        except OSError as error:
+            if code_of(error) in _INVALID_RANGE:
+                return 0
+            raise
+        async with found["Body"] as body:
+            await body.read()
+        return int(found["ContentRange"].rpartition("/")[2])
 
     def _abort_uploads(self) -> None:
         """End uploads in parts that nobody goes on with: their parts are paid for."""
@@ -307,8 +363,32 @@ class BucketBlobs:
                 )
 
 
-def bucket_place(config: StoreConfig, *, cache: Path) -> BucketPlace | None:
-    """The bucket that the settings name, None where blobs are files; ConfigError for none."""
+def listed(client: BucketClient, beginning: str) -> Iterator[tuple[str, int]]:
+    """Key, without the prefix, and length of every object below; a page in memory at a time."""
+    skip = len(client.place.key(""))
+    more: dict[str, str] = {}
+    while True:
+        page = client.call("list", "list_objects_v2", Prefix=client.place.key(beginning), **more)
+        for entry in page.get("Contents", ()):
+            yield entry["Key"][skip:], int(entry["Size"])
+        if not page.get("IsTruncated"):
+            return
+        more = {"ContinuationToken": page["NextContinuationToken"]}
+
+
+def delete(client: BucketClient, *, below: str) -> None:
+    """Delete every object whose key begins like this."""
+    _delete(client, [key for key, _ in listed(client, below)])
+
+
+def put_file(client: BucketClient, path: Path, key: str) -> None:
+    """Upload a file, in parts where it is long."""
+    put, place = client.files._put_file, client.place
+    client.run("put", put(path, place.path(key), chunksize=place.part_bytes))
+
+
+def bucket_of(config: StoreConfig, folder: Path) -> BucketPlace | None:
+    """The bucket that the settings name, None where blobs are files; `folder`: the data folder."""
     if not config.blobs:
         return None
     bucket, _, prefix = config.blobs.removeprefix("s3://").strip("/").partition("/")
@@ -319,7 +399,7 @@ def bucket_place(config: StoreConfig, *, cache: Path) -> BucketPlace | None:
         region=config.s3_region,
         part_bytes=config.s3_part_bytes,
         timeout_s=config.s3_timeout_s,
-        cache=cache,
+        cache=folder / _CACHE,
         cache_bytes=config.blob_cache_bytes,
     )
 
@@ -334,7 +414,7 @@ def _shard(beginning: str) -> str:
 
 def _read(client: BucketClient, sha256: str) -> bytes:
     try:
-        data = _whole(client, _key(sha256))
+        data = whole(client, _key(sha256))
     except NotFound:
         where = client.place.path(_key(sha256))
         raise NotFound(f"the stored blob s3://{where} is missing; restore it") from None
@@ -343,7 +423,8 @@ def _read(client: BucketClient, sha256: str) -> bytes:
     return data
 
 
-def _whole(client: BucketClient, key: str) -> bytes:
+def whole(client: BucketClient, key: str) -> bytes:
+    """All of an object, unchecked; NotFound without it."""
     return client.run("get", client.files._cat_file(client.place.path(key), max_concurrency=1))
 
 

@@ -24,6 +24,8 @@ RETRY_S = 1.0
 """How long callers are asked to wait while the bucket is away."""
 AT_ONCE = 32
 """Requests of one call that are under way at a time."""
+UPLOADS_AT_ONCE = 8
+"""Of one process: each holds a blob, or four parts of it, in memory."""
 CONNECT_S = 5.0
 _LIBRARIES = ("aiobotocore", "botocore", "s3fs", "fsspec", "aiohttp")
 _WRONG_KEYS = ("InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "InvalidToken")
@@ -68,6 +70,7 @@ class BucketClient:
         """ConfigError where s3fs is not installed, or the credentials' profile is not there."""
         self.place = place
         self._observer = observer
+        self._uploads = asyncio.Semaphore(UPLOADS_AT_ONCE)
         self.files = _file_system(place)
 
     def run(self, operation: str, work: Awaitable[T]) -> T:
@@ -85,7 +88,7 @@ class BucketClient:
             return done
 
     async def _gather(self, operation: str, works: Sequence[Awaitable[T]]) -> list[T]:
-        places = asyncio.Semaphore(AT_ONCE)
+        places = self._uploads if operation == "put" else asyncio.Semaphore(AT_ONCE)
 
         async def one(work: Awaitable[T]) -> T:
             async with places:

@@ -26,7 +26,7 @@ from magic_server.store.agents import AgentTable
 from magic_server.store.archive import ArchiveTable, ImportedSubmap
 from magic_server.store.blob_store import BlobObserver, BlobStore, WrittenBlob
 from magic_server.store.blobs import BlobFolder, SharedBlobFolder
-from magic_server.store.bucket import BucketBlobs, bucket_place
+from magic_server.store.bucket import BucketBlobs, bucket_of
 from magic_server.store.commit_lock import CommitLock, SharedCommitLock
 from magic_server.store.committing import SubmapCommits
 from magic_server.store.database import Database
@@ -47,7 +47,6 @@ from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
-_CACHE = "blob-cache"
 
 
 class Store:
@@ -67,7 +66,7 @@ class Store:
 
         `observer` hears of every request to a bucket.
         """
-        place = bucket_place(config or StoreConfig(), cache=folder / _CACHE)
+        place = bucket_of(config or StoreConfig(), folder)
         engine = engine_of(config or StoreConfig(), folder)
         if config is not None and config.index == "pgvector" and not engine.shared:
             raise ConfigError.field(
@@ -77,11 +76,11 @@ class Store:
         self.folder = folder
         # What this server alone writes and reads.
         self.scratch = folder / "replicas" / replica if engine.shared else folder
-        self._bucket: BucketBlobs | None = None
+        self.bucket: BucketBlobs | None = None
         self.blobs: BlobStore
         if place is not None:
             server = replica if engine.shared else ""
-            self.blobs = self._bucket = BucketBlobs(place, server=server, observer=observer)
+            self.blobs = self.bucket = BucketBlobs(place, server=server, observer=observer)
         elif engine.shared:
             self.blobs = SharedBlobFolder(folder, self.scratch)
         else:
@@ -131,8 +130,8 @@ class Store:
         else:
             self._lock_files.append(ownership.lock(self.scratch))
         await self._database.open(first=self._require_database)
-        if self._bucket is not None:
-            await self._in_thread(self._bucket.mark, self._identity)
+        if self.bucket is not None:
+            await self._in_thread(self.bucket.mark, self._identity)
         if self._descriptors is not None:
             await self._descriptors.open()
         await self._in_thread(self._open_folders)
@@ -144,16 +143,16 @@ class Store:
     async def _require_database(self, connection: AsyncConnection) -> None:
         """Raise WrongState unless blobs and database belong together; while nobody else can."""
         found = await connection.scalar(sa.select(identity.c.id))
-        if self._bucket is None and self.leases is None:
+        if self.bucket is None and self.leases is None:
             await self._require_folder(connection, found)
             return
         self._identity = found or uuid.uuid4().hex
-        if self._bucket is None:
+        if self.bucket is None:
             ownership.require_database(self.folder, self._identity, is_new=found is None)
         else:
             if self.leases is not None:
                 ownership.require_no_sqlite(self.folder)
-            require, new = self._bucket.require, not await _refers_to_blobs(connection)
+            require, new = self.bucket.require, not await _refers_to_blobs(connection)
             await self._in_thread(lambda: require(self._identity, may_be_new=new))
         if found is None:
             await connection.execute(sa.insert(identity), {"id": self._identity})

@@ -27,6 +27,7 @@ from magic_server.server import Server
 from magic_server.store_config import StoreConfig
 from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import stored_files
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -38,23 +39,23 @@ def name_of(index: int, agent: int = 0) -> str:
     return f"{SESSION}/agents/agent_{agent}/submaps/{index}"
 
 
-def config_in(folder: Path, store: StoreConfig) -> ServerConfig:
+def config_in(folder: Path, store: StoreConfig, jobs: JobConfig) -> ServerConfig:
     return ServerConfig(
         data_dir=folder,
         store=store,
         listen=ListenConfig(port=0, stop_grace_s=2.0),
-        jobs=JobConfig(workers=1, niceness=0),
+        jobs=jobs,
         loops=LoopConfig(enabled=False),
     )
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def source(
-    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore, jobs: JobConfig
 ) -> AsyncIterator[MagicClient]:
     """A server whose session has two agents, a loop, a deleted sub-map and a merged map."""
     async with (
-        Server(config_in(tmp_path_factory.mktemp("source"), new_store())) as server,
+        Server(config_in(tmp_path_factory.mktemp("source"), new_store(), jobs)) as server,
         MagicClient(server.address, ClientConfig(rpc_timeout_s=60.0)) as client,
     ):
         for agent, count in ((0, SUBMAPS), (1, 1)):
@@ -84,10 +85,10 @@ async def archive(source: MagicClient) -> bytes:
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
 async def target(
-    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore, jobs: JobConfig
 ) -> AsyncIterator[Server]:
     """Another server, empty; tests that store something delete it again."""
-    async with Server(config_in(tmp_path_factory.mktemp("target"), new_store())) as server:
+    async with Server(config_in(tmp_path_factory.mktemp("target"), new_store(), jobs)) as server:
         yield server
 
 
@@ -96,10 +97,8 @@ async def pieces(data: bytes, size: int = 70_000) -> AsyncIterator[bytes]:
         yield data[begin : begin + size]
 
 
-def files_in(server: Server) -> list[Path]:
-    root = server.config.data_dir
-    folders = (root / "blobs", root / "incoming")
-    return [file for folder in folders for file in folder.rglob("*") if file.is_file()]
+def files_in(server: Server) -> list[str]:
+    return stored_files(server.config)
 
 
 async def assert_same(first: MagicClient, second: MagicClient) -> None:
@@ -177,7 +176,7 @@ async def test_the_command_moves_a_session_between_a_server_and_a_folder(
     assert (await run(magic, "list", *folder))[0] == 1
     code, imported = await run(magic, "import", file, *folder)
     assert (code, imported["submap_count"]) == (0, shown["submap_count"])
-    async with Server(config_in(tmp_path / "store", StoreConfig())) as server:
+    async with Server(config_in(tmp_path / "store", StoreConfig(), JobConfig(workers=1))) as server:
         assert (await run(magic, "list", *folder))[0] == 1  # in use by a server
         async with MagicClient(server.address) as client:
             await assert_same(source, client)

@@ -28,6 +28,7 @@ from magic_server.server import Server
 from magic_server.store import Store
 from tests.faults.proxy import Proxy, Weather
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import stored_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +72,6 @@ class Pieces:
         self.reads += 1
         for begin in range(0, len(self.data), 4096):
             yield self.data[begin : begin + 4096]
-
-
-def stored_files(config: ServerConfig) -> list[Path]:
-    folders = (config.data_dir / "blobs", config.data_dir / "incoming")
-    return [file for folder in folders for file in folder.rglob("*") if file.is_file()]
 
 
 async def test_a_repeat_gets_the_first_answer_whatever_happened_since(
@@ -157,7 +153,7 @@ async def test_an_import_without_one_id_is_refused_and_leaves_nothing(
     async with grpc.aio.insecure_channel(server.address) as channel:
         stub = session_grpc.SessionServiceStub(channel)
         with pytest.raises(grpc.RpcError) as refused:
-            await stub.ImportSession(iter(requests), timeout=30)
+            await stub.ImportSession(iter(requests), timeout=60)
     error = error_of(refused.value)
     assert isinstance(error, InvalidInput)
     assert said in str(error)

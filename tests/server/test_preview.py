@@ -22,12 +22,12 @@ from tests.small_world import DIMENSION, MODEL_ID, make_submap
 PREVIEW = "sessions/room/maps/preview"
 
 
-def config_of(folder, store: StoreConfig, **preview) -> ServerConfig:
+def config_of(folder, store: StoreConfig, jobs: JobConfig, **preview) -> ServerConfig:
     return ServerConfig(
         data_dir=folder,
         store=store,
         listen=ListenConfig(port=0, stop_grace_s=1.0),
-        jobs=JobConfig(workers=1, niceness=0),
+        jobs=jobs,
         preview=PreviewConfig(**preview),
     )
 
@@ -45,9 +45,11 @@ def assert_same_places(found: GaussianCloud, expected: GaussianCloud) -> None:
         np.testing.assert_allclose(np.sort(cloud_axis), np.sort(expected_axis), atol=6e-4)
 
 
-async def test_the_preview_is_there_before_any_merge_and_follows(tmp_path, new_store: NewStore):
+async def test_the_preview_is_there_before_any_merge_and_follows(
+    tmp_path, new_store: NewStore, jobs: JobConfig
+):
     submaps = [make_submap(agent=0, index=i) for i in range(3)]
-    server_config = config_of(tmp_path, new_store(), interval_s=0.1)
+    server_config = config_of(tmp_path, new_store(), jobs, interval_s=0.1)
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
         with pytest.raises(NotFound, match="nothing to show"):
@@ -92,15 +94,16 @@ async def eventually(condition) -> None:
 async def caught_up(client: MagicClient):
     """The newest poses, and the preview once it shows them."""
 
+    found = []
+
     async def equal() -> bool:
         info, _ = await client.download_global_map(PREVIEW, format="lossless")
-        return info.revision == (await client.get_corrected_poses("room")).revision
+        snapshot = await client.get_corrected_poses("room")
+        found[:] = [snapshot, info]  # while both grow they are equal for a moment only
+        return info.revision == snapshot.revision
 
     await eventually(equal)
-    snapshot = await client.get_corrected_poses("room")
-    info, _ = await client.download_global_map(PREVIEW, format="lossless")
-    assert info.revision == snapshot.revision
-    return snapshot, info
+    return found
 
 
 async def placed(client: MagicClient, count: int):
@@ -118,8 +121,10 @@ async def placed(client: MagicClient, count: int):
     return info, await client.get_global_map(PREVIEW)
 
 
-async def test_without_following_it_is_made_when_asked_for(tmp_path, new_store: NewStore):
-    server_config = config_of(tmp_path, new_store(), enabled=False)
+async def test_without_following_it_is_made_when_asked_for(
+    tmp_path, new_store: NewStore, jobs: JobConfig
+):
+    server_config = config_of(tmp_path, new_store(), jobs, enabled=False)
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
         submap = make_submap(agent=0, index=0)

@@ -27,6 +27,7 @@ from magic_server.loops import LoopConfig
 from magic_server.server import Server
 from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap, path
+from tests.stored import stored_files
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -35,13 +36,15 @@ SUBMAPS = 4
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory, new_store: NewStore) -> ServerConfig:
+def config(
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore, jobs: JobConfig
+) -> ServerConfig:
     """Without loops, so that a session's graph is its odometry."""
     return ServerConfig(
         data_dir=tmp_path_factory.mktemp("delete"),
         store=new_store(),
         listen=ListenConfig(port=0, stop_grace_s=2.0),
-        jobs=JobConfig(workers=1, niceness=0),
+        jobs=jobs,
         loops=LoopConfig(enabled=False),
     )
 
@@ -85,8 +88,7 @@ async def settled(server: Server, client: MagicClient):
 
 
 def blobs(server: Server) -> set[str]:
-    root = server.config.data_dir / "blobs"
-    return {file.name for file in root.rglob("*") if file.is_file()}
+    return set(stored_files(server.config))
 
 
 async def digests(client: MagicClient, name: str) -> set[str]:
@@ -333,7 +335,7 @@ async def test_a_deletion_needs_a_request_id(bad: str, client: MagicClient, serv
         stub = session_grpc.SessionServiceStub(channel)
         request = session_pb.DeleteSessionRequest(name="sessions/room", request_id=bad)
         with pytest.raises(grpc.RpcError) as caught:
-            await stub.DeleteSession(request, timeout=20)
+            await stub.DeleteSession(request, timeout=60)
     assert isinstance(error_of(caught.value), InvalidInput)
     assert len(await client.list_submaps("room")) == 1
 

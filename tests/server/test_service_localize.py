@@ -43,13 +43,14 @@ SUBMAPS = 2
 async def mapped(
     tmp_path_factory: pytest.TempPathFactory,
     new_store: NewStore,
+    jobs: JobConfig,
 ) -> AsyncIterator[tuple[Server, MagicClient]]:
     """A server started again on a map that one agent left, and an empty session beside it."""
     config = ServerConfig(
         data_dir=tmp_path_factory.mktemp("localize"),
         store=new_store(),
         listen=ListenConfig(port=0, stop_grace_s=2.0),
-        jobs=JobConfig(workers=1, niceness=0),
+        jobs=jobs,
         loops=LoopConfig(enabled=False),
     )
     async with Server(config) as first, MagicClient(first.address) as client:
@@ -165,7 +166,7 @@ async def test_a_malformed_request_is_refused_by_its_field(what: str, mapped) ->
 async def refusal_of(server: Server, sent: mapping_pb.LocalizeRequest) -> MagicError:
     async with grpc.aio.insecure_channel(server.address) as channel:
         with pytest.raises(grpc.RpcError) as caught:
-            await mapping_grpc.MappingServiceStub(channel).Localize(sent, timeout=20)
+            await mapping_grpc.MappingServiceStub(channel).Localize(sent, timeout=60)
     return error_of(caught.value)
 
 

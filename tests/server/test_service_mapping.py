@@ -44,12 +44,14 @@ def name_of(agent: int, index: int) -> str:
 
 
 @pytest.fixture(scope="module")
-def config(tmp_path_factory: pytest.TempPathFactory, new_store: NewStore) -> ServerConfig:
+def config(
+    tmp_path_factory: pytest.TempPathFactory, new_store: NewStore, jobs: JobConfig
+) -> ServerConfig:
     return ServerConfig(
         data_dir=tmp_path_factory.mktemp("mapping"),
         store=new_store(),
         listen=ListenConfig(port=0, stop_grace_s=600.0),
-        jobs=JobConfig(workers=2, niceness=0),
+        jobs=dataclasses.replace(jobs, workers=2),
         loops=LoopConfig(top_k=2),
     )
 
@@ -217,14 +219,15 @@ async def test_a_watch_that_reaches_its_deadline_goes_on_and_repeats_nothing(map
     server, client, _ = mapped
     newest = (await client.get_corrected_poses("room")).revision
     seen: list[int] = []
-    async with MagicClient(server.address, ClientConfig(watch_timeout_s=0.1)) as short:
+    async with MagicClient(server.address, ClientConfig(watch_timeout_s=0.5)) as short:
 
         async def watch() -> None:
             async for snapshot in short.watch_corrected_poses("room"):
                 seen.append(snapshot.revision)
 
         watcher = asyncio.create_task(watch())
-        await asyncio.wait([watcher], timeout=0.6)
+        await eventually(lambda: seen or watcher.done())
+        await asyncio.wait([watcher], timeout=1.5)  # two deadlines more, or three
         assert not watcher.done()
         watcher.cancel()
     assert seen == [newest]

@@ -33,6 +33,7 @@ from magic_server.server import Server
 from magic_server.upload_config import PartialUploadLimits
 from tests.postgresql import scratch_of
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import put_stray
 from tests.waiting import eventually
 
 CHUNK = 1000
@@ -392,10 +393,8 @@ async def test_files_that_nothing_refers_to_are_collected_while_the_server_runs(
         await register(client)
         await client.submit_encoded(encoded())
         kept = set(server._store.blobs.names())
-        stray = server._store.blobs.path("ab" * 32)
-        stray.write_bytes(b"left by a transaction that failed")
-        await eventually(lambda: not stray.exists())
-        assert set(server._store.blobs.names()) == kept
+        put_stray(server._store.blobs, "ab" * 32, b"left by a transaction that failed")
+        await eventually(lambda: set(server._store.blobs.names()) == kept)
         assert (await client.download_encoded(NAME)).blobs == encoded().blobs
 
 

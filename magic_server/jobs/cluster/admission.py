@@ -1,27 +1,48 @@
-"""Which workers a server gives jobs to: those that are like it and see its data folder.
+"""Which workers a server gives jobs to: those that are like it and reach its blobs.
 
 A server marks its data folder with an id. Each worker that joins the cluster is asked, by this
-module running there, whether it finds that mark; if so it offers the resource `store-<id>`, which
-every job of the server demands. A worker that cannot do the work is thus never given any.
+module running there, whether it finds that mark or, where blobs are in a bucket, whether the bucket
+lets it in; if so it offers the resource `store-<id>`, which every job of the server demands. A
+worker that cannot do the work is thus never given any.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import platform
 import socket
 import uuid
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magic_core.errors import MagicError
 from magic_server.jobs.cluster.slots import slots_of
+from magic_server.store.bucket_client import BucketPlace, client_of, look
 
 if TYPE_CHECKING:
     from distributed import Worker
 
 ID_FILE = "cluster-id"
+
+
+@dataclass(frozen=True, slots=True)
+class ServedStore:
+    """What workers must reach to work for a server."""
+
+    id: str
+    folder: str
+    """Path of its data folder, on the server."""
+    bucket: BucketPlace | None
+    """Where its blobs are, None where they are in that folder."""
+
+    @property
+    def shared_folder(self) -> str:
+        """The folder that workers share; empty where they share the bucket alone."""
+        return "" if self.bucket else self.folder
 
 
 def versions() -> tuple[str, str]:
@@ -48,21 +69,26 @@ def resource_of(store: str) -> str:
 
 
 async def admit(
-    store: str, folder: str, expected: tuple[str, str], *, dask_worker: Worker
+    store: ServedStore, expected: tuple[str, str], *, dask_worker: Worker
 ) -> str | None:
     """Let a worker offer its service to a server, or say why it does not. Runs on the worker."""
     slots = slots_of(dask_worker)
-    refusal = _refusal(store, slots.root(folder), expected)
+    root = slots.root(store.shared_folder)
+    refusal = await asyncio.to_thread(_refusal, store, root, expected)
     if refusal is None:
-        await dask_worker.set_resources(**{resource_of(store): float(dask_worker.state.nthreads)})
+        await dask_worker.set_resources(
+            **{resource_of(store.id): float(dask_worker.state.nthreads)}
+        )
     return refusal
 
 
-def _refusal(store: str, root: Path, expected: tuple[str, str]) -> str | None:
+def _refusal(store: ServedStore, root: Path, expected: tuple[str, str]) -> str | None:
     here = socket.gethostname()
     if versions() != expected:
         own, wanted = (f"magic-slam {m} on Python {p}" for m, p in (versions(), expected))
         return f"{here} has {own}, the server {wanted}; install the same on both"
+    if store.bucket is not None:
+        return _refusal_of_bucket(store.bucket, here)
     remedy = "mount the server's data folder there, and give magic worker --data-dir where it is"
     try:
         found = (root / ID_FILE).read_text().strip()
@@ -70,8 +96,16 @@ def _refusal(store: str, root: Path, expected: tuple[str, str]) -> str | None:
         return (
             f"{here} does not see the server's data folder at {root} ({error.strerror}); {remedy}"
         )
-    if found != store:
+    if found != store.id:
         return f"{root} on {here} is the data folder of another server; {remedy}"
     if not os.access(root, os.W_OK):
         return f"{root} on {here} cannot be written; mount it so that its user may write"
+    return None
+
+
+def _refusal_of_bucket(place: BucketPlace, here: str) -> str | None:
+    try:
+        look(client_of(place))
+    except MagicError as error:
+        return f"{here}: {error.message}"
     return None

@@ -12,11 +12,10 @@ import contextlib
 import logging
 import time
 import uuid
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magic_core.errors import Unavailable
-from magic_server.jobs.cluster.admission import versions
+from magic_server.jobs.cluster.admission import ServedStore, versions
 from magic_server.jobs.cluster.gate import PriorityGate
 from magic_server.jobs.cluster.roster import Needs, Roster
 from magic_server.jobs.cluster.slots import run_sealed
@@ -66,13 +65,11 @@ class Flight:
 class Dispatch:
     """One server's jobs on one cluster; lives in an event loop of its own."""
 
-    def __init__(
-        self, config: JobConfig, *, folder: Path, store: str, security: Security | None
-    ) -> None:
+    def __init__(self, config: JobConfig, *, store: ServedStore, security: Security | None) -> None:
         self._config = config
-        self._folder = str(folder.absolute())
+        self._folder = store.shared_folder
         self._security = security
-        self._roster = Roster(config.scheduler, folder, store)
+        self._roster = Roster(config.scheduler, store)
         self._merging = parse_resources(config.merge_resources, field="jobs.merge_resources")
         # Jobs that wait for a special worker are counted apart, so that they hold up no others.
         self._gate = PriorityGate(config.in_flight)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from magic_core import tracing
 from magic_core.errors import Unavailable
-from magic_server.jobs.cluster.admission import mark
+from magic_server.jobs.cluster.admission import ServedStore, mark
 from magic_server.jobs.cluster.dispatch import Dispatch
 from magic_server.jobs.cluster.library import require_distributed, security_of
 from magic_server.jobs.config import JobConfig
@@ -21,19 +21,21 @@ from magic_server.jobs.kinds import kind_of
 from magic_server.jobs.protocol import JobObserver
 from magic_server.jobs.sealing import JobFailed, SealedJob, seal, unseal
 from magic_server.jobs.worker import JobDone
+from magic_server.store.bucket_client import BucketPlace
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
 class DaskExecutor(CountedJobs):
-    """Jobs wherever a `magic worker` is connected to the scheduler and sees the data folder."""
+    """Jobs wherever a `magic worker` is connected to the scheduler and reaches the blobs."""
 
     def __init__(
         self,
         config: JobConfig,
         *,
         folder: Path,
+        bucket: BucketPlace | None = None,
         observer: JobObserver = lambda job, outcome, waited_s, ran_s: None,
     ) -> None:
         """Raises ConfigError without Dask or with certificates that cannot be used."""
@@ -42,6 +44,7 @@ class DaskExecutor(CountedJobs):
         self._security = security_of(config.tls, field="jobs.tls")
         self._config = config
         self._folder = folder
+        self._bucket = bucket
         self._observer = observer
         # Dask has a loop of its own: large messages and its bookkeeping hold up no call.
         self._loop = asyncio.new_event_loop()
@@ -59,12 +62,19 @@ class DaskExecutor(CountedJobs):
         """How many jobs could run at once now."""
         return 0 if self._dispatch is None else self._dispatch.slots
 
+    @property
+    def shares_folder(self) -> bool:
+        """Where blobs are in a bucket, workers need nothing else of the server's."""
+        return self._bucket is None
+
     async def start(self) -> None:
         """Begin to connect; a scheduler that is away is waited for, which the log says."""
         store = await asyncio.to_thread(mark, self._folder)
         self._thread.start()
         self._dispatch = Dispatch(
-            self._config, folder=self._folder, store=store, security=self._security
+            self._config,
+            store=ServedStore(store, str(self._folder.absolute()), self._bucket),
+            security=self._security,
         )
         self._keeping = self._over_there(self._dispatch.keep_connected())
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magic_server.jobs.cluster.admission import admit, resource_of, versions
+from magic_server.jobs.cluster.admission import ServedStore, admit, resource_of, versions
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -28,16 +26,15 @@ Needs = Mapping[str, float]
 class Roster:
     """Asks every new worker whether it can do this server's jobs."""
 
-    def __init__(self, scheduler: str, folder: Path, store: str) -> None:
+    def __init__(self, scheduler: str, store: ServedStore) -> None:
         self._scheduler = scheduler
-        self._folder = os.path.abspath(folder)
-        self._resource = resource_of(store)
+        self._resource = resource_of(store.id)
         self._store = store
         self._known: dict[str, dict[str, Any]] = {}
         self._refused: dict[str, tuple[float, str]] = {}
 
     def needs(self, special: Needs) -> dict[str, float]:
-        """What a job demands of a worker: that it sees the data folder, and what is special."""
+        """What a job demands of a worker: that it reaches the blobs, and what is special."""
         return {self._resource: 1.0, **special}
 
     def slots(self, special: Needs) -> int:
@@ -104,7 +101,7 @@ class Roster:
 
     async def _ask(self, client: Client, address: str) -> str | None:
         """None where a worker is admitted, else why it is not."""
-        question = (self._store, self._folder, versions())
+        question = (self._store, versions())
         try:
             async with asyncio.timeout(ANSWER_S):
                 answers = await client.run(admit, *question, workers=[address], on_error="return")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +36,8 @@ class WorkerSettings:
     """How a worker runs its jobs."""
 
     data_dir: Path | None = None
-    """Where the server's data folder is here; None where it is under the same path as there."""
+    """Where the server's data folder is here; None where it is under the same path as there. Where
+    blobs are in a bucket, any folder: for what jobs read and make."""
     threads: int = 1
     """Threads of the numerical libraries in each job."""
     niceness: int = 5
@@ -49,10 +51,16 @@ class JobSlots:
     def __init__(self, settings: WorkerSettings = WorkerSettings()) -> None:
         self._settings = settings
         self._idle: list[ProcessExecutor] = []
+        self._own: tempfile.TemporaryDirectory[str] | None = None
 
     def root(self, folder: str) -> Path:
-        """Where a server's data folder is here."""
-        return self._settings.data_dir or Path(folder)
+        """Where a server's data folder is here; a folder of this worker's own where no path says
+        which is shared."""
+        if self._settings.data_dir or folder:
+            return self._settings.data_dir or Path(folder)
+        if self._own is None:
+            self._own = tempfile.TemporaryDirectory(prefix="magic-worker-")
+        return Path(self._own.name)
 
     async def run(
         self, message: bytes, root: Path, *, job: str, wanted: Callable[[], bool]
@@ -80,6 +88,9 @@ class JobSlots:
         """End the processes that have nothing to do; the others end with their jobs."""
         while self._idle:
             await self._idle.pop().close()
+        if self._own is not None:
+            self._own.cleanup()
+            self._own = None
 
     def _new_process(self) -> ProcessExecutor:
         settings = self._settings
@@ -104,7 +115,8 @@ def slots_of(worker: Worker) -> JobSlots:
 async def run_sealed(key: str, folder: str, message: bytes) -> bytes:
     """The one Dask task there is: run a sealed job on this worker.
 
-    `key` is its own key, `folder` the path of the server's data folder on the server.
+    `key` is its own key, `folder` the path of the server's data folder on the server, empty where
+    that is not shared.
     """
     from distributed import get_worker
 
