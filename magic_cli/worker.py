@@ -2,8 +2,9 @@
 
 Start `dask scheduler` once, a worker on every machine that shall compute, and servers with
 `magic serve --jobs.executor dask --jobs.scheduler tcp://HOST:8786`. All of them need the extra
-`cluster` and the server's data folder (docs/cluster.md). Whoever reaches the scheduler or a worker
-can run code there: keep them in a network you trust, or give certificates.
+`cluster`; workers read the server's blobs, in its data folder or, with the AWS credentials of their
+own environment, in its bucket (docs/cluster.md). Whoever reaches the scheduler or a worker can run
+code there: keep them in a network you trust, or give certificates.
 
 Examples:
   magic worker tcp://10.0.0.5:8786
@@ -52,7 +53,8 @@ class WorkerCommand:
     name: str = ""
     """What this worker is called, once in a cluster; default: host name and process id."""
     data_dir: Path | None = None
-    """Where the server's data folder is mounted here; default: under the same path as there."""
+    """Where the server's data folder is mounted here; default: under the same path as there. With
+    blobs in a bucket: a folder for what jobs read and make; default: a temporary one."""
     processes: int = 1
     """Jobs at a time, each in a process of its own."""
     threads: int = 1
@@ -84,7 +86,7 @@ class WorkerCommand:
         if self.data_dir is not None and not self.data_dir.is_dir():
             raise ConfigError.field(
                 "data_dir",
-                f"{self.data_dir} is no folder here; mount the server's data folder first",
+                f"{self.data_dir} is no folder here; mount or make it first",
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import hashlib
 import logging
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from magic_core.errors import ConfigError, CorruptData, NotFound, Unavailable, WrongState
+from magic_server.jobs.delivery import Deliveries
 from magic_server.store import BlobWriter, Store
 from magic_server.store.bucket import BucketBlob, BucketBlobs, bucket_of, listed
 from magic_server.store.bucket_client import BucketClient
@@ -187,6 +189,29 @@ def test_jobs_read_through_a_bounded_cache_that_is_checked(
     assert newest.head(3) == contents[-1][:3]
     with pytest.raises(NotFound):
         BucketBlob(blobs.place, "ab" * 32).read()
+
+
+async def test_a_job_leaves_files_in_the_bucket_which_the_server_reads_and_adopts(
+    config: StoreConfig, store: Store
+) -> None:
+    deliveries = Deliveries(store, shares_folder=False)
+    data = bytes(range(256)) * 1000
+    delivery = pickle.loads(pickle.dumps(deliveries.of(store.scratch / "merge-7")))
+    assert delivery.progress() is None
+    with delivery.working() as folder:
+        (folder / "map").write_bytes(data)
+        file = pickle.loads(pickle.dumps(delivery.deliver(folder / "map")))
+        delivery.report((0.25, "refining"))
+    assert not folder.exists()
+    assert delivery.progress() == (0.25, "refining")
+    with contextlib.closing(deliveries.opened(file)) as opened_file:
+        assert opened_file.read(200_000) + opened_file.read(200_000) == data
+    blob = deliveries.adoptable(file)
+    assert (blob.sha256, blob.length) == (hashlib.sha256(data).hexdigest(), len(data))
+    store.blobs.adopt([blob])
+    delivery.clear()
+    assert keys(config) == [f"blobs/{blob.sha256[0]}/{blob.sha256}", "database-id"]
+    assert store.blobs.read(blob.sha256) == data
 
 
 async def test_a_submap_is_found_again_by_another_store(

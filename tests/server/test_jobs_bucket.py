@@ -1,0 +1,80 @@
+"""Jobs of a Dask cluster whose workers share a bucket with the server, and no folder."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from magic_core.errors import CorruptData, Unavailable
+from magic_core.tracing import TracingConfig
+from magic_server.jobs import JobConfig, JobExecutor, new_executor
+from magic_server.store import BlobWriter
+from magic_server.store.bucket import BucketBlob, BucketBlobs, bucket_of
+from magic_server.store.bucket_client import BucketPlace
+from tests.bucket import BucketServer
+from tests.cluster import Cluster
+
+pytestmark = pytest.mark.slow
+
+
+@asynccontextmanager
+async def dask_jobs(
+    cluster: Cluster, folder: Path, place: BucketPlace, *, timeout_s: float = 60.0
+) -> AsyncIterator[JobExecutor]:
+    config = JobConfig(executor="dask", scheduler=cluster.address, connect_timeout_s=timeout_s)
+    trace = TracingConfig()
+    jobs = new_executor(config, folder=folder, trace=trace, observer=lambda *_: None, bucket=place)
+    await jobs.start()
+    try:
+        yield jobs
+    finally:
+        await jobs.close()
+
+
+@pytest.fixture
+def place(bucket_server: BucketServer, tmp_path: Path) -> BucketPlace:
+    (tmp_path / "server").mkdir()
+    found = bucket_of(bucket_server.store(), tmp_path / "server")
+    assert found is not None
+    return found
+
+
+async def test_workers_read_checked_blobs_and_keep_them_on_their_own_disk(
+    cluster: Cluster, bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
+) -> None:
+    blobs = BucketBlobs(place, server="one")
+    blob = BlobWriter(tmp_path)
+    blob.write(b"content")
+    blob.finish()
+    blobs.adopt([blob])
+    async with dask_jobs(cluster, tmp_path / "server", place) as jobs:
+        assert not jobs.shares_folder
+        handle = BucketBlob(place, blob.sha256)
+        assert await jobs.run(BucketBlob.read, handle) == b"content"
+        theirs: Path = await jobs.run(Path.absolute, place.cache)
+        assert theirs == place.cache  # under the data folder on both sides of the border
+        assert not place.cache.exists()
+        blobs.remove([blob.sha256])
+        assert await jobs.run(BucketBlob.read, handle) == b"content"  # from the worker's cache
+        damaged = BucketBlob(place, "ab" * 32)
+        path = place.path(f"blobs/a/{damaged.sha256}")
+        bucket_server.files().pipe_file(path, b"something else")
+        with pytest.raises(CorruptData, match=f"{damaged.sha256} is damaged"):
+            await jobs.run(BucketBlob.read, damaged)
+
+
+async def test_a_worker_that_the_bucket_does_not_let_in_is_given_no_jobs(
+    cluster: Cluster, place: BucketPlace, tmp_path: Path
+) -> None:
+    missing = dataclasses.replace(place, bucket="no-such-bucket")
+    async with dask_jobs(cluster, tmp_path / "server", missing, timeout_s=20.0) as jobs:
+        with pytest.raises(Unavailable, match="create the bucket no-such-bucket"):
+            await jobs.run(localize_image)
+
+
+def localize_image() -> None:
+    """A job that is impatient, by its name."""
