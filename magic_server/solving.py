@@ -3,7 +3,8 @@
 Two tasks. One takes in what is new (sub-maps, accepted loops, finished solves), stores the change
 and publishes it as a revision; that takes milliseconds, however large the graph. The other solves
 the whole graph in a worker process whenever something is unsettled, and rests between two solves
-for as long as one took, so that it never takes more than half of a worker.
+for as long as one took, so that it never takes more than half of a worker. A large graph is kept at
+its optimum by the first (`posegraph.hierarchy`), and only doubt about a loop unsettles it.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from magic_server.store import SessionRow, Store
 logger = logging.getLogger(__name__)
 
 RETRY_S = 1.0
-MAX_REST_S = 10.0
+MAX_REST_S = 300.0
 JOURNAL_SHARE = 0.5
 """Changes are stored one by one until together they are this large, relative to the whole."""
 LEAST_JOURNAL_BYTES = 100_000

@@ -77,7 +77,7 @@ def _moved(
     covariance = safe_inverse(edges.information)
     covariance[:, range(6), range(6)] += np.repeat(added, 3, axis=1)
     # A residual at the target vertex is seen from the body's frame: the adjoint of its offset.
-    to_vertex = _adjoint(stacked.inverse(offset[target]))
+    to_vertex = stacked.adjoint(stacked.inverse(offset[target]))
     information = to_vertex.swapaxes(1, 2) @ np.linalg.inv(covariance) @ to_vertex
     return EdgeArrays(
         body[source],
@@ -85,15 +85,3 @@ def _moved(
         offset[source] @ edges.source_from_target @ stacked.inverse(offset[target]),
         0.5 * (information + information.swapaxes(1, 2)),
     )
-
-
-def _adjoint(transforms: Array) -> Array:
-    """(m, 6, 6) adjoints of (m, 4, 4) transforms, (translation, rotation)."""
-    rotation, t = transforms[:, :3, :3], transforms[:, :3, 3]
-    cross = np.zeros((len(t), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = t
-    cross[:, [1, 2, 0], [2, 0, 1]] = -t
-    result = np.zeros((len(t), 6, 6))
-    result[:, :3, :3] = result[:, 3:, 3:] = rotation
-    result[:, :3, 3:] = cross @ rotation
-    return result

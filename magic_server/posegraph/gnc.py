@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph.arrays import EdgeArrays
+from magic_server.posegraph.hierarchy import Hierarchy
 from magic_server.posegraph.optimiser import (
     FactorCache,
     anchored,
@@ -76,7 +77,16 @@ class GncResult:
 class RobustGraph:
     """A component with trusted edges and doubtful loops, solved again and again."""
 
-    def __init__(self, odometry: EdgeArrays, loops: EdgeArrays, anchors: dict[int, Array]) -> None:
+    def __init__(
+        self,
+        odometry: EdgeArrays,
+        loops: EdgeArrays,
+        anchors: dict[int, Array],
+        *,
+        hierarchical: bool = False,
+    ) -> None:
+        """`hierarchical` condenses regions for the last steps to the optimum."""
+        self._hierarchical = hierarchical
         self.odometry = odometry
         self.loops = loops
         self.anchors = anchors
@@ -97,6 +107,20 @@ class RobustGraph:
         found = poses_of(values, len(poses))
         self._last = found, values
         return found
+
+    def optimum(self, poses: Array, kept: NDArray[np.bool_]) -> Array:
+        """Poses (n, 4, 4) at the optimum with the loops that are kept, from near it."""
+        if self._hierarchical:
+            edges = EdgeArrays.joined([self.odometry, self.loops.select(kept)])
+            found = poses.copy()
+            for vertex, pose in self.anchors.items():
+                found[vertex] = pose
+            Hierarchy(found, edges, self.anchors).settle(found, limit=np.inf, exactly=True)
+            if edges.squared_norms(found).sum() <= edges.squared_norms(poses).sum():
+                return found
+        return self.solve(
+            poses, kept.astype(float), max_iterations=FINAL_ITERATIONS, tolerance=FINELY
+        )
 
     def _values(self, poses: Array) -> gtsam.Values:
         """GTSAM's copy of the poses; that of the last result is still at hand."""
@@ -183,9 +207,7 @@ def polished(
             break
         kept = fits
     if final:
-        poses = graph.solve(
-            poses, kept.astype(float), max_iterations=FINAL_ITERATIONS, tolerance=FINELY
-        )
+        poses = graph.optimum(poses, kept)
     return GncResult(poses=poses, kept=kept, start=start)
 
 

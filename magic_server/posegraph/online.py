@@ -6,6 +6,9 @@ moves. An accepted loop that agrees with the estimate moves a neighbourhood of b
 hundred. A loop that does not agree, that would join two components or move a sub-map far, is in
 doubt: it counts once a solve of the whole graph (`solve_arrays`, elsewhere and robust) has taken it
 up. Such a solve is adopted whenever it comes; what arrived meanwhile is placed again on top of it.
+
+A large graph is condensed by regions (`Hierarchy`): loops that are taken up then bring all poses to
+the optimum at once, and a solve of the whole graph is asked for by doubt alone.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph.arrays import ArraySolution, EdgeArrays, GraphArrays
+from magic_server.posegraph.growing import EdgeRows, Rows
+from magic_server.posegraph.hierarchy import Hierarchy
 from magic_server.posegraph.neighbourhood import Adjacency, adjusted
 from magic_server.posegraph.problem import Edge, PoseGraphConfig
 
@@ -26,6 +31,9 @@ Numbers = NDArray[np.int64]
 NOTICEABLE_M = 1e-5
 NOTICEABLE_RAD = 1e-6
 """A pose that moved by less is not news."""
+LARGE_NOTICEABLE_M = 1e-3
+LARGE_NOTICEABLE_RAD = 3e-4
+"""The same where the graph is condensed by regions: every loop moves much by very little."""
 TRIED_PER_STEP = 8
 """Loops that a step tries to take up; more than that wait for the solve of the whole graph."""
 
@@ -71,16 +79,18 @@ class OnlineGraph:
         self._odometry: list[Edge] = []
         self._odometry_of: dict[int, int] = {}
         self._loops: list[Edge] = []
-        self._widened = _Edges()
-        self._loop_edges = _Edges()
+        self._widened = EdgeRows()
+        self._loop_edges = EdgeRows()
+        self._hierarchy: Hierarchy | None = None
+        self._condensed: dict[int, int] = {}
+        """Of each loop that counts: its number in the hierarchy."""
+        self._strained: set[int] = set()
+        """Edges of the hierarchy that are known to be beyond their limit."""
         self._adjacency = Adjacency()
         self._priors: dict[int, Array] = {}
-        self.poses = np.zeros((0, 4, 4))
-        self.component = np.zeros(0, dtype=np.int64)
-        self.kept = np.zeros(0, dtype=bool)
-        self._told = np.zeros((0, 4, 4))
-        self._told_component = np.zeros(0, dtype=np.int64)
-        self._told_kept = np.zeros(0, dtype=bool)
+        self._poses, self._told = Rows((4, 4)), Rows((4, 4))
+        self._component, self._told_component = Rows((), np.int64), Rows((), np.int64)
+        self._kept, self._told_kept = Rows((), np.bool_), Rows((), np.bool_)
         self._groups: list[str] = []
         self.members: dict[int, dict[str, int]] = {}
         """Of each component, by its oldest vertex: how many vertices each group has in it."""
@@ -90,6 +100,21 @@ class OnlineGraph:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def poses(self) -> Array:
+        """(n, 4, 4), each in the frame of its component."""
+        return self._poses.view
+
+    @property
+    def component(self) -> Numbers:
+        """(n,) the number of the oldest vertex of its component."""
+        return self._component.view
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """(m,) which loops count."""
+        return self._kept.view
 
     @property
     def loop_count(self) -> int:
@@ -125,12 +150,13 @@ class OnlineGraph:
         for name, (component, pose) in poses.items():
             if name in self.number and component in self.number:
                 number = self.number[name]
-                self.poses[number] = self._told[number] = pose
-                self.component[number] = self._told_component[number] = self.number[component]
+                self.poses[number] = self._told.view[number] = pose
+                self.component[number] = self.number[component]
+                self._told_component.view[number] = self.number[component]
         for number in kept:
             self._keep(number)
-            self._told_kept[number] = True
-        self._touched = set(np.flatnonzero(np.isnan(self._told[:, 0, 0])).tolist())
+            self._told_kept.view[number] = True
+        self._touched = set(np.flatnonzero(np.isnan(self._told.view[:, 0, 0])).tolist())
         self._count_members()
         self.unsettled = bool(vertices) and not settled
 
@@ -148,10 +174,15 @@ class OnlineGraph:
         again = self._adopt(solution) if solution is not None else ()
         for vertex in vertices:
             touched.add(self._add_vertex(vertex))
-        added = [self._add_loop(loop) for loop in loops]
-        for number in (*again, *added)[-TRIED_PER_STEP:]:
-            touched |= self._tried(number)
-        self.unsettled |= bool(again or added)
+        waiting = [*again, *(self._add_loop(loop) for loop in loops)]
+        if self._hierarchy is None and self._config.is_hierarchical(len(self)):
+            touched |= self._condense()
+        if self._hierarchy is not None:
+            touched |= self._settled_with(waiting)
+        else:
+            for number in waiting[-TRIED_PER_STEP:]:
+                touched |= self._tried(number)
+            self.unsettled |= bool(waiting)
         every = np.arange(len(self)) if solution is not None else None
         return self._news(np.array(sorted(touched), dtype=np.int64) if every is None else every)
 
@@ -172,6 +203,7 @@ class OnlineGraph:
         Returns the loops that came since, of which none counts any more.
         """
         count, loops = len(solution.poses), len(solution.kept)
+        self._hierarchy = None
         self.poses[:count] = solution.poses
         self.component[:count] = solution.component
         for number in np.flatnonzero(solution.kept != self.kept[:loops]).tolist():
@@ -199,11 +231,13 @@ class OnlineGraph:
             edge = EdgeArrays.of([vertex.odometry], self.number)
             added = self._widened.add(edge.with_odometry_floor(self._config))
             self._adjacency.add_odometry(added, *edge.ends(0))
-        self.poses = _grown(self.poses, np.eye(4))
-        self.component = _grown(self.component, np.int64(number))
-        self._told = _grown(self._told, np.full((4, 4), np.nan))
-        self._told_component = _grown(self._told_component, np.int64(-1))
+        self._poses.append(np.eye(4))
+        self._component.append(number)
+        self._told.append(np.nan)
+        self._told_component.append(-1)
         self._place(number)
+        if self._hierarchy is not None:
+            self._condense_vertex(number)
         self._groups.append(vertex.group)
         self._count(number)
         return number
@@ -233,20 +267,24 @@ class OnlineGraph:
 
     def _add_loop(self, loop: Edge) -> int:
         self._loops.append(loop)
-        self.kept = _grown(self.kept, np.bool_(False))
-        self._told_kept = _grown(self._told_kept, np.bool_(False))
+        self._kept.append(False)
+        self._told_kept.append(False)
         return self._loop_edges.add(EdgeArrays.of([loop], self.number))
 
     def _keep(self, number: int, kept: bool = True) -> None:
         if kept != self.kept[number]:
             self.kept[number] = kept
             change = self._adjacency.add_loop if kept else self._adjacency.remove_loop
-            change(number, *self._loop_edges.one(number).ends(0))
+            change(number, *self._loop_edges.ends(number))
+            if self._hierarchy is not None and kept:
+                self._condensed[number] = self._hierarchy.add_edge(self._loop_edges.some([number]))
+            elif self._hierarchy is not None:
+                self._hierarchy.remove_edge(self._condensed.pop(number))
 
     def _tried(self, number: int) -> set[int]:
         """Take up a loop if that is certain; the vertices that moved. In doubt, none does."""
-        source, target = self._loop_edges.one(number).ends(0)
-        if self._config.robust == "none" or self.component[source] != self.component[target]:
+        source, target = self._loop_edges.ends(number)
+        if not self._may_be_tried(number):
             return set()
         inside = self._adjacency.around((source, target))
         own, other = self._adjacency.edges_of(inside)
@@ -256,56 +294,108 @@ class OnlineGraph:
         moved = adjusted(inside, trusted, loops, self.poses, fixed=fixed, limit=self._limit)
         if moved is None or self._moves_too_far(inside, moved):
             return set()
-        self.poses[inside] = moved
+        if self._hierarchy is None:
+            self.poses[inside] = moved
         self._keep(number)
         return set(inside)
 
-    def _moves_too_far(self, inside: list[int], moved: Array) -> bool:
+    def _may_be_tried(self, loop: int) -> bool:
+        source, target = self._loop_edges.ends(loop)
+        return self._config.robust != "none" and self.component[source] == self.component[target]
+
+    def _moves_too_far(self, inside: Sequence[int], moved: Array) -> bool:
         step = np.linalg.norm(moved[:, :3, 3] - self.poses[inside][:, :3, 3], axis=1)
         return bool(step.max(initial=0.0) > self._config.max_unsupported_correction_m)
+
+    # By regions
+
+    def _condense(self) -> set[int]:
+        """Begin the hierarchy with everything that counts; the vertices that moved."""
+        kept = np.flatnonzero(self.kept)
+        odometry = self._widened.some(np.arange(len(self._widened)))
+        edges = EdgeArrays.joined([odometry, self._loop_edges.some(kept)])
+        held = [v for v in range(len(self)) if self._is_held(v)]
+        self._hierarchy = Hierarchy(self.poses, edges, held)
+        numbers = range(len(odometry), len(edges))
+        self._condensed = dict(zip(kept.tolist(), numbers, strict=True))
+        settled = self._hierarchy.settle(self.poses, limit=self._limit)
+        self._strained = set(settled.strained.tolist())
+        return set(settled.moved.tolist())
+
+    def _condense_vertex(self, number: int) -> None:
+        """Take a vertex that was just placed, and what it hangs on, into the hierarchy."""
+        assert self._hierarchy is not None
+        held = self._is_held(number)
+        edge = self._odometry_of.get(number)
+        if edge is None:
+            self._hierarchy.add_vertex(None, self.poses[number], held=held)
+            return
+        before = self.number[self._odometry[edge].source]
+        self._hierarchy.add_vertex(before, self.poses[number], held=held)
+        self._hierarchy.add_edge(self._widened.some([edge]))
+
+    def _is_held(self, number: int) -> bool:
+        return number in self._priors or self.component[number] == number
+
+    def _settled_with(self, loops: Iterable[int]) -> set[int]:
+        """Take up loops that are certain and bring all poses to the optimum; those that moved."""
+        doubtful = [number for number in loops if not self._tried(number)]
+        touched = self._settled()
+        for number in doubtful:
+            touched |= self._tried_by_all(number)
+        self.unsettled |= not self.kept[doubtful].all()
+        return touched
+
+    def _settled(self) -> set[int]:
+        moved, strained = self._settlement()
+        # What fitted when it was taken up may contradict what came since.
+        self._strained |= strained
+        self.unsettled |= bool(strained)
+        return set(moved.tolist())
+
+    def _settlement(self) -> tuple[Numbers, set[int]]:
+        """Bring all poses to the optimum; which moved, which edges are newly beyond the limit."""
+        assert self._hierarchy is not None
+        settled = self._hierarchy.settle(self.poses, limit=self._limit)
+        return settled.moved, set(settled.strained.tolist()) - self._strained
+
+    def _tried_by_all(self, number: int) -> set[int]:
+        """Take up a loop that its neighbourhood alone does not agree with, if the graph does."""
+        if self._hierarchy is None or not self._may_be_tried(number):
+            return set()
+        before = self.poses.copy()
+        self._keep(number)
+        moved, strained = self._settlement()
+        if strained or self._moves_too_far(moved.tolist(), before[moved]):
+            self._keep(number, False)
+            self.poses[moved] = before[moved]
+            self._hierarchy.moved(moved.tolist())
+            return self._settled()
+        return set(moved.tolist())
 
     # Telling
 
     def _news(self, numbers: Numbers) -> Change:
         """Of some vertices, those that differ from what was told, which they are from now on."""
-        now, before = self.poses[numbers], self._told[numbers]
+        large = self._hierarchy is not None
+        least_m = LARGE_NOTICEABLE_M if large else NOTICEABLE_M
+        least_rad = LARGE_NOTICEABLE_RAD if large else NOTICEABLE_RAD
+        now, before = self.poses[numbers], self._told.view[numbers]
         new = np.isnan(before[:, 0, 0])
         before = np.where(new[:, None, None], now, before)
         step_m = np.linalg.norm(now[:, :3, 3] - before[:, :3, 3], axis=1)
         # The small-angle form is exact enough to tell whether there is news.
         turn_rad = np.linalg.norm(now[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
-        news = new | (step_m > NOTICEABLE_M) | (turn_rad > NOTICEABLE_RAD)
-        news |= self.component[numbers] != self._told_component[numbers]
-        flipped = self.kept != self._told_kept
+        news = new | (step_m > least_m) | (turn_rad > least_rad)
+        news |= self.component[numbers] != self._told_component.view[numbers]
+        flipped = self.kept != self._told_kept.view
         change = Change(
             vertices=numbers[news],
             taken_up=np.flatnonzero(flipped & self.kept),
             dropped=np.flatnonzero(flipped & ~self.kept),
             largest_move_m=float(step_m.max(initial=0.0)),
         )
-        self._told[change.vertices] = self.poses[change.vertices]
-        self._told_component[change.vertices] = self.component[change.vertices]
-        self._told_kept = self.kept.copy()
+        self._told.view[change.vertices] = self.poses[change.vertices]
+        self._told_component.view[change.vertices] = self.component[change.vertices]
+        self._told_kept.view[flipped] = self.kept[flipped]
         return change
-
-
-class _Edges:
-    """Edges that are added one at a time and read a few at a time."""
-
-    def __init__(self) -> None:
-        self._rows: list[EdgeArrays] = []
-
-    def add(self, edge: EdgeArrays) -> int:
-        self._rows.append(edge)
-        return len(self._rows) - 1
-
-    def one(self, number: int) -> EdgeArrays:
-        return self._rows[number]
-
-    def some(self, numbers: Sequence[int]) -> EdgeArrays:
-        rows = [self._rows[number] for number in numbers]
-        return EdgeArrays.joined(rows)
-
-
-def _grown(rows: NDArray, row: NDArray | np.generic) -> NDArray:
-    return np.concatenate([rows, np.asarray(row, dtype=rows.dtype)[None]])

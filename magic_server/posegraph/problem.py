@@ -45,6 +45,15 @@ class PoseGraphConfig:
     odometry's own uncertainty explains, needs a second consistent loop before it counts."""
     max_iterations: int = 100
     """Levenberg-Marquardt iterations of the final solve."""
+    hierarchy: Literal["auto", "on", "off"] = "auto"
+    """Condense regions of the graph onto the separators between them, so that a new sub-map costs
+    what its neighbourhood costs: `auto` does so from `hierarchy_from` sub-maps on."""
+    hierarchy_from: int = 2000
+    """How large a graph must be for `hierarchy` `auto`; smaller ones are solved as a whole."""
+
+    def is_hierarchical(self, count: int) -> bool:
+        """Whether a graph of so many sub-maps is condensed by regions."""
+        return self.hierarchy == "on" or (self.hierarchy == "auto" and count >= self.hierarchy_from)
 
     @property
     def squared_norm_limit(self) -> float:
@@ -64,8 +73,13 @@ class PoseGraphConfig:
         for name in ("odometry_floor_m", "odometry_floor_rad", "odometry_floor_share"):
             if getattr(self, name) < 0:
                 raise ConfigError.field(f"posegraph.{name}", "must not be negative")
-        if self.max_iterations < 1:
-            raise ConfigError.field("posegraph.max_iterations", "expected at least 1")
+        for name in ("max_iterations", "hierarchy_from"):
+            if getattr(self, name) < 1:
+                raise ConfigError.field(f"posegraph.{name}", "expected at least 1")
+        if self.hierarchy not in ("auto", "on", "off"):
+            raise ConfigError.field(
+                "posegraph.hierarchy", f"{self.hierarchy!r}: expected auto, on or off"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,7 +98,8 @@ def solve_part(part: Part, config: PoseGraphConfig) -> GncResult:
         start = place(part.chains, part.loops, known)
         return GncResult(start, np.zeros(0, dtype=bool), start)
     anchors = part.priors or {0: np.eye(4)}
-    graph = RobustGraph(part.odometry, part.loops, anchors)
+    regional = config.is_hierarchical(len(part.chains.chain))
+    graph = RobustGraph(part.odometry, part.loops, anchors, hierarchical=regional)
     if config.robust == "gnc":
         return RobustSolver(graph, part.chains, part.priors, config).solve(part.initial)
     weights = np.ones(len(part.loops))

@@ -16,6 +16,7 @@ def solve_files(
     paths: Sequence[Path],
     *,
     robust: Literal["none", "gnc"] = "gnc",
+    hierarchy: Literal["auto", "on", "off"] = "auto",
     output: Path | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, Any]:
@@ -28,7 +29,11 @@ def solve_files(
     graph = read_g2o(paths)
     problem = problem_of(graph)
     config = PoseGraphConfig(
-        robust=robust, odometry_floor_m=0.0, odometry_floor_rad=0.0, odometry_floor_share=0.0
+        robust=robust,
+        hierarchy=hierarchy,
+        odometry_floor_m=0.0,
+        odometry_floor_rad=0.0,
+        odometry_floor_share=0.0,
     )
     started = clock()
     solution = solve(problem, config)

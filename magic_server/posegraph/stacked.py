@@ -33,6 +33,42 @@ def log(transforms: Array) -> Array:
     return np.concatenate([rho, phi], axis=-1)
 
 
+def exp(vectors: Array) -> Array:
+    """Transforms (n, 4, 4) of tangent vectors (n, 6), (translation, rotation)."""
+    rho, phi = vectors[..., :3], vectors[..., 3:]
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = angle < _SMALL_ANGLE_RAD
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
+    second = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    third = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    hat = cross_matrices(phi)
+    twice = hat @ hat
+    result = np.zeros((*vectors.shape[:-1], 4, 4))
+    result[..., :3, :3] = np.eye(3) + first * hat + second * twice
+    left = np.eye(3) + second * hat + third * twice
+    result[..., :3, 3] = (left @ rho[..., None])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """(n, 3, 3) matrices that take the cross product with (n, 3) vectors from the left."""
+    result = np.zeros((*vectors.shape[:-1], 3, 3))
+    result[..., [2, 0, 1], [1, 2, 0]] = vectors
+    result[..., [1, 2, 0], [2, 0, 1]] = -vectors
+    return result
+
+
+def adjoint(transforms: Array) -> Array:
+    """(n, 6, 6) adjoints of (n, 4, 4) transforms, (translation, rotation)."""
+    rotation = transforms[..., :3, :3]
+    result = np.zeros((*transforms.shape[:-2], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = rotation
+    result[..., :3, 3:] = cross_matrices(transforms[..., :3, 3]) @ rotation
+    return result
+
+
 def rotation_log(rotations: Array) -> Array:
     """Rotation vectors (n, 3) of (n, 3, 3) rotations, exact near 0 and pi (by quaternions)."""
     quaternions = quaternions_from_rotations(rotations)
