@@ -18,7 +18,6 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass
-from pathlib import Path
 from types import FrameType
 from typing import Self
 
@@ -29,6 +28,8 @@ logger = logging.getLogger(__name__)
 class Stall:
     """One time in which the loop did not run."""
 
+    at_s: float
+    """When it was over, seconds since the monitor began."""
     seconds: float
     """How long, less `waited_s`."""
     gap_s: float
@@ -65,29 +66,38 @@ class LoopMonitor:
         self._watcher: threading.Thread | None = None
         self._stop = threading.Event()
         self._thread_id = 0
+        self._began = 0.0
         self._last_beat = 0.0
         self._seen = ""
         self._gc_started = 0.0
         self._gc_s = 0.0
 
     async def __aenter__(self) -> Self:
+        self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    def start(self) -> None:
+        """Watch the running loop from now on."""
         self._thread_id = threading.get_ident()
-        self._last_beat = time.perf_counter()
+        self._began = self._last_beat = time.perf_counter()
         gc.callbacks.append(self._on_gc)
         self._watcher = threading.Thread(target=self._watch, name="loop-watcher", daemon=True)
         self._watcher.start()
         self._task = asyncio.create_task(self._beat(), name="loop monitor")
-        return self
 
-    async def __aexit__(self, *_: object) -> None:
+    async def stop(self) -> None:
+        """Watch no more; nothing where it never began."""
+        if self._task is None or self._watcher is None:
+            return
         self._stop.set()
         gc.callbacks.remove(self._on_gc)
-        if self._task is not None:
-            self._task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._task
-        if self._watcher is not None:
-            await asyncio.to_thread(self._watcher.join)
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+        await asyncio.to_thread(self._watcher.join)
 
     async def _beat(self) -> None:
         waits, cpu = _waits(), time.thread_time()
@@ -113,7 +123,8 @@ class LoopMonitor:
         if seconds <= self.threshold_s:
             return
         used = time.thread_time() - cpu
-        stall = Stall(seconds, gap, waited, used, self._gc_s, self._seen)
+        at_s = time.perf_counter() - self._began
+        stall = Stall(at_s, seconds, gap, waited, used, self._gc_s, self._seen)
         self.count += 1
         self.stalls = sorted([*self.stalls, stall], key=lambda s: -s.seconds)[:100]
         logger.warning("the event loop stood still for %.0f ms\n%s", seconds * 1e3, stall.stack)
@@ -135,17 +146,27 @@ class LoopMonitor:
 
 def _waits() -> dict[str, float]:
     """Seconds that each thread of this process was ready to run but did not, by thread id."""
-    waits: dict[str, float] = {}
-    for file in Path("/proc/self/task").glob("*/schedstat"):
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            waits[file.parent.name] = int(file.read_text().split()[1]) * 1e-9
-    waits["stolen"] = _stolen()
+    waits = {"stolen": _stolen()}
+    with contextlib.suppress(OSError):  # no Linux
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                line = _first_bytes(f"/proc/self/task/{thread}/schedstat")
+                waits[thread] = int(line.split()[1]) * 1e-9
     return waits
 
 
 def _stolen() -> float:
     """Seconds that a hypervisor kept processors from this machine since it started."""
     with contextlib.suppress(OSError, ValueError, IndexError):
-        ticks = int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8])
+        ticks = int(_first_bytes("/proc/stat").split(b"\n", 1)[0].split()[8])
         return ticks / os.sysconf("SC_CLK_TCK")
     return 0.0
+
+
+def _first_bytes(path: str) -> bytes:
+    """The beginning of a small file, in as few calls as can be: each may cost the loop its turn."""
+    file = os.open(path, os.O_RDONLY)
+    try:
+        return os.read(file, 512)
+    finally:
+        os.close(file)

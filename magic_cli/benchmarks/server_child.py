@@ -1,4 +1,4 @@
-"""The server under load, in a process of its own that watches its event loop.
+"""The server under load, in a process of its own that watches its event loop from when it is ready.
 
 Prints a line with its address once it serves, and one with what it saw when it has stopped.
 """
@@ -25,14 +25,25 @@ def config_of(data_dir: Path) -> ServerConfig:
 
 async def run(data_dir: Path) -> None:
     """Serve until told to stop."""
+    monitor = LoopMonitor(threshold_s=STALL_S)
 
     def ready(server: Server) -> None:
+        # Starting loads libraries, which hold the interpreter lock; nobody is served meanwhile.
+        monitor.start()
         print(json.dumps({"address": server.address}), flush=True)
 
-    async with LoopMonitor(threshold_s=STALL_S) as monitor:
+    try:
         await serve(config_of(data_dir), on_ready=ready)
+    finally:
+        await monitor.stop()
     worst = [
-        {"ms": round(1e3 * stall.seconds), "stack": stall.stack.splitlines()[-6:]}
+        {
+            "ms": round(1e3 * stall.seconds),
+            "at_s": round(stall.at_s, 1),
+            "cpu_ms": round(1e3 * stall.cpu_s),
+            "gc_ms": round(1e3 * stall.gc_s),
+            "stack": stall.stack.splitlines()[-6:],
+        }
         for stall in monitor.stalls[:5]
     ]
     print(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from magic_core.geometry import se3
 from magic_core.submap import Keyframe, OdometryEdge, Submap, TrackedFrame
-from magic_core.wire import EncodedSubmap, geometry, names
+from magic_core.wire import EncodedSubmap, depth_planes, geometry, images, names
 from magic_core.wire.chunks import sha256
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def _submap(
     poses = [anchor_from_world @ pose for pose in worlds]
     poses[0] = np.eye(4)
     kept = np.linspace(0, FRAMES - 1, KEYFRAMES).astype(int).tolist()
-    images = {i: source[first + i] for i in kept}
+    frames = {i: source[first + i] for i in kept}
     rng = np.random.default_rng([agent, index])
     return Submap(
         session=SESSION,
@@ -95,22 +96,22 @@ def _submap(
         index=index,
         camera=source.camera,
         gaussians=seed_uniform(
-            images[0].colour,
-            images[0].depth,
+            frames[0].colour,
+            frames[0].depth,
             source.camera,
-            need=images[0].depth > 0,
+            need=frames[0].depth > 0,
             count=GAUSSIANS,
             existing=np.zeros((0, 3), np.float32),
             rng=rng,
         ),
         keyframes=tuple(
-            Keyframe(i, times_and_poses[i][0], poses[i], image.colour, image.depth)
-            for i, image in images.items()
+            Keyframe(i, times_and_poses[i][0], poses[i], frame.colour, frame.depth)
+            for i, frame in frames.items()
         ),
         trajectory=tuple(
             TrackedFrame(i, time_s, poses[i]) for i, (time_s, _) in enumerate(times_and_poses)
         ),
-        descriptor=describe(images[0].colour),
+        descriptor=describe(frames[0].colour),
     )
 
 
@@ -123,12 +124,12 @@ def replayed(recording: Recording, *, agent: int, index: int) -> EncodedSubmap:
     walk = recording.walks[agent % len(recording.walks)]
     recorded = walk[_to_and_fro(index, len(walk))]
     unique = agent * 100_000 + index
-    blobs = tuple(
-        _varied(data, info, unique)
-        for data, info in zip(recorded.encoded.blobs, recorded.encoded.header.blobs, strict=True)
-    )
     header = submap_pb2.SubmapHeader()
     header.CopyFrom(recorded.encoded.header)
+    blobs = tuple(
+        _varied(data, info, unique)
+        for data, info in zip(recorded.encoded.blobs, header.blobs, strict=True)
+    )
     header.name = names.submap_name(SESSION, f"load_{agent}", index)
     header.request_id = header.name
     for info, data in zip(header.blobs, blobs, strict=True):
@@ -152,16 +153,23 @@ def _to_and_fro(index: int, length: int) -> int:
 
 
 def _varied(data: bytes, info: submap_pb2.BlobInfo, unique: int) -> bytes:
-    """The same content in other bytes."""
+    """The same content in other bytes; depth becomes PNG, which has room for a comment."""
     if info.role == submap_pb2.BLOB_ROLE_GAUSSIANS:
         return _with_moved_origin(data, unique)
-    if info.media_type == "image/jpeg":
+    if info.media_type == images.DEPTH_PLANES:
+        data, info.media_type = _as_png(data), images.PNG
+    if info.media_type == images.JPEG:
         comment = b"%016d" % unique
         segment = b"\xff\xfe" + (len(comment) + 2).to_bytes(2, "big") + comment
         return data[:2] + segment + data[2:]
     body = b"tEXt" + b"load\x00%016d" % unique
     chunk = (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
     return data[:33] + chunk + data[33:]
+
+
+@functools.lru_cache(maxsize=AGENTS * SUBMAPS * KEYFRAMES)
+def _as_png(depth: bytes) -> bytes:
+    return images.encode_depth_png(depth_planes.decode(depth).astype(np.float32), metres_per_unit=1)
 
 
 def _with_moved_origin(data: bytes, unique: int) -> bytes:

@@ -30,7 +30,9 @@ class FailedCall(grpc.RpcError):
 
 
 def all_classes(kind: type[MagicError] = MagicError) -> list[type[MagicError]]:
-    return [kind, *(c for sub in kind.__subclasses__() for c in all_classes(sub))]
+    """Every error of the public tree; what else derives from them never leaves its process."""
+    below = [sub for sub in kind.__subclasses__() if sub.__module__ == errors.__name__]
+    return [kind, *(found for sub in below for found in all_classes(sub))]
 
 
 @pytest.mark.parametrize("kind", all_classes())
@@ -42,6 +44,16 @@ def test_every_error_comes_back_as_itself(kind: type[MagicError]) -> None:
     caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
     assert type(caught) is kind
     assert (caught.message, caught.violations) == (raised.message, violations)
+
+
+def test_an_error_of_one_process_alone_comes_back_as_its_public_kind() -> None:
+    class Private(errors.Unavailable):
+        pass
+
+    status = grpc_status_of(Private("the message"))
+    caught = error_of(FailedCall(status.code, status.details, status.trailing_metadata))
+    assert type(caught) is errors.Unavailable
+    assert caught.message == "the message"
 
 
 def test_the_server_to_ask_instead_crosses_the_wire_and_process_borders() -> None:

@@ -125,7 +125,11 @@ def _config(settings: dict[str, Any]):
         data_dir=Path(settings["data_dir"]),
         store=StoreConfig(database=settings.get("database", "")),
         cluster=ClusterConfig(replica=settings.get("replica", "")),
-        listen=ListenConfig(port=settings.get("port", 0), stop_grace_s=2.0, transport=transport),
+        listen=ListenConfig(
+            port=settings.get("port", 0),
+            stop_grace_s=settings.get("stop_grace_s", 2.0),
+            transport=transport,
+        ),
         jobs=JobConfig(workers=1, niceness=settings.get("niceness", 0)),
         loops=loops,
     )

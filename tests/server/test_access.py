@@ -187,7 +187,7 @@ async def test_an_agent_may_be_asked_for_from_its_own_session_only(callers: Call
         session="sessions/room", agent="sessions/other/agents/agent_0"
     )
     with pytest.raises(grpc.RpcError) as caught:
-        await viewer.mapping_stub.GetCorrectedPoses(request, timeout=20)
+        await viewer.mapping_stub.GetCorrectedPoses(request, timeout=60)
     assert caught.value.code() == grpc.StatusCode.PERMISSION_DENIED  # type: ignore[attr-defined]
 
 
@@ -228,7 +228,7 @@ async def test_every_chunk_of_a_stream_belongs_to_the_authorised_header(
         yield mapping_pb.SubmitSubmapRequest(header=theirs.header)
 
     with pytest.raises(grpc.RpcError) as caught:
-        await callers("alice").mapping_stub.SubmitSubmap(stream(), timeout=20)
+        await callers("alice").mapping_stub.SubmitSubmap(stream(), timeout=60)
     assert isinstance(error_of(caught.value), PermissionDenied)
 
 
@@ -238,13 +238,13 @@ async def test_reflection_asks_for_a_token_and_health_does_not(locked: Server) -
 
     async with grpc.aio.insecure_channel(locked.address) as channel:
         health = health_pb2_grpc.HealthStub(channel)
-        answer = await health.Check(health_pb2.HealthCheckRequest(), timeout=20)
+        answer = await health.Check(health_pb2.HealthCheckRequest(), timeout=60)
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
         stub = reflection_pb2_grpc.ServerReflectionStub(channel)
 
         def listing(metadata=()):
             request = reflection_pb2.ServerReflectionRequest(list_services="")
-            return stub.ServerReflectionInfo(iter([request]), timeout=20, metadata=metadata)
+            return stub.ServerReflectionInfo(iter([request]), timeout=60, metadata=metadata)
 
         with pytest.raises(grpc.RpcError) as caught:
             await anext(aiter(listing()))
@@ -365,10 +365,21 @@ async def test_tls_encrypts_and_takes_tokens(secured: ServerConfig, tmp_path: Pa
         async with MagicClient(server.address, ClientConfig(credentials=credentials)) as client:
             assert await client.list_sessions() == ()
         stranger = Authority(tmp_path / "other").client()
-        config = ClientConfig(credentials=stranger, connect_timeout_s=1.0)
-        with pytest.raises(Unavailable, match="CERTIFICATE_VERIFY_FAILED"):
+        await assert_not_connected(server, stranger, "CERTIFICATE_VERIFY_FAILED")
+
+
+async def assert_not_connected(server: Server, credentials: ClientCredentials, why: str) -> None:
+    """A client does not get through; a machine that is slow needs longer to hear why."""
+    said = ""
+    for patience_s in (1.0, 5.0, 20.0):
+        config = ClientConfig(credentials=credentials, connect_timeout_s=patience_s)
+        with pytest.raises(Unavailable) as caught:
             async with MagicClient(server.address, config):
                 pass
+        said = str(caught.value)
+        if why in said:
+            return
+    raise AssertionError(f"{why!r} is not in {said!r}")
 
 
 async def test_a_certificate_is_a_caller(server_config: ServerConfig, tmp_path: Path) -> None:
@@ -391,10 +402,7 @@ async def test_a_certificate_is_a_caller(server_config: ServerConfig, tmp_path: 
             with pytest.raises(Unauthenticated):
                 await register(client)
         for credentials in (authority.client(), authority.client("late", expired=True)):
-            config_ = ClientConfig(credentials=credentials, connect_timeout_s=1.0)
-            with pytest.raises(Unavailable):
-                async with MagicClient(server.address, config_):
-                    pass
+            await assert_not_connected(server, credentials, "")
 
 
 async def test_a_new_certificate_is_taken_up_without_a_restart(
@@ -402,12 +410,11 @@ async def test_a_new_certificate_is_taken_up_without_a_restart(
 ) -> None:
     authority = Authority(tmp_path / "ca")
     config = dataclasses.replace(server_config, tls=authority.server(expired=True))
-    client_config = ClientConfig(credentials=authority.client(), connect_timeout_s=1.0)
+    credentials = authority.client()
     async with Server(config) as server:
-        with pytest.raises(Unavailable, match="certificate has expired"):
-            async with MagicClient(server.address, client_config):
-                pass
+        await assert_not_connected(server, credentials, "certificate has expired")
         authority.server()
+        client_config = ClientConfig(credentials=credentials, connect_timeout_s=60.0)
         async with MagicClient(server.address, client_config) as client:
             assert await client.list_sessions() == ()
 

@@ -32,13 +32,13 @@ NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 
 async def health(channel: grpc.aio.Channel, service: str) -> int:
     stub = health_pb2_grpc.HealthStub(channel)
-    return (await stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=20)).status
+    return (await stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=60)).status
 
 
 async def draining(channel: grpc.aio.Channel) -> None:
     """Wait until the server says that it is not ready."""
     watch = health_pb2_grpc.HealthStub(channel).Watch(
-        health_pb2.HealthCheckRequest(service=READINESS), timeout=20
+        health_pb2.HealthCheckRequest(service=READINESS), timeout=60
     )
     async for answer in watch:
         if answer.status == NOT_SERVING:
@@ -85,8 +85,9 @@ async def test_one_sigterm_drains_and_a_second_ends_at_once(
 ) -> None:
     async with ServerForge() as forge:
         drained, ended = tmp_path / "drained", tmp_path / "ended"
-        await drains(await forge.start({"data_dir": str(drained)}))
-        await ends_at_once(await forge.start({"data_dir": str(ended)}))
+        # Time enough to finish what is sent, however slowly: only the second signal cuts it.
+        await drains(await forge.start({"data_dir": str(drained), "stop_grace_s": 600.0}))
+        await ends_at_once(await forge.start({"data_dir": str(ended), "stop_grace_s": 600.0}))
     again = ServerConfig(data_dir=drained, listen=server_config.listen, jobs=server_config.jobs)
     async with Server(again) as server, MagicClient(server.address, ClientConfig()) as client:
         stored = [info.name for info in await client.list_submaps("room")]
@@ -104,7 +105,7 @@ async def drains(process: ServerProcess) -> None:
     assert await health(channel, "magicslam.v1.MappingService") == NOT_SERVING
     with pytest.raises(grpc.RpcError) as caught:
         await session_grpc.SessionServiceStub(channel).ListSessions(
-            session_pb.ListSessionsRequest(), timeout=20
+            session_pb.ListSessionsRequest(), timeout=60
         )
     refusal = error_of(caught.value)
     assert isinstance(refusal, Unavailable)

@@ -32,11 +32,11 @@ async def test_bytes_that_are_no_message_are_invalid_input(path: str, server: Se
     async with grpc.aio.insecure_channel(server.address) as channel:
         call = channel.unary_unary(f"/magicslam.v1.{path}")
         with pytest.raises(grpc.aio.AioRpcError) as caught:
-            await call(b"\x0a\xff\xff\xff\xff\x0f", timeout=20)
+            await call(b"\x0a\xff\xff\xff\xff\x0f", timeout=60)
         assert type(error_of(caught.value)) is InvalidInput
         upload = channel.stream_unary("/magicslam.v1.MappingService/SubmitSubmap")
         with pytest.raises(grpc.aio.AioRpcError) as caught:
-            await upload(iter([b"\x0a\xff\xff\xff\xff\x0f"]), timeout=20)
+            await upload(iter([b"\x0a\xff\xff\xff\xff\x0f"]), timeout=60)
         assert type(error_of(caught.value)) is InvalidInput
 
 

@@ -203,10 +203,10 @@ def test_a_worker_ends_when_told_to_whether_or_not_there_is_a_scheduler(tmp_path
         assert cluster.scheduler is not None
         cluster.scheduler.terminate()
         one.terminate()
-        assert one.wait(30.0) == 0
-        cluster.scheduler.wait(30.0)
+        assert one.wait(120.0) == 0
+        cluster.scheduler.wait(120.0)
         two.terminate()
-        assert two.wait(30.0) == 0
+        assert two.wait(120.0) == 0
 
 
 @pytest.mark.slow
@@ -344,9 +344,11 @@ async def test_a_gate_keeps_its_bound_its_order_and_forgets_who_gave_up() -> Non
     visits[1].cancel()
     await asyncio.gather(visits[1], return_exceptions=True)
     gate.set_slots(1)
+    await eventually(lambda: len(inside) == 2)
     await asyncio.sleep(0.01)
     assert inside == [5, 3]
     gate.set_slots(8)  # no more than `most`
+    await eventually(lambda: len(inside) == 3)
     await asyncio.sleep(0.01)
     assert inside == [5, 3, 2]
     leave.set()

@@ -47,7 +47,7 @@ async def get(server: Server, path: str) -> tuple[int, str]:
     def fetch() -> tuple[int, str]:
         try:
             url = f"http://{server.metrics_address}{path}"
-            with urllib.request.urlopen(url, timeout=20) as answer:
+            with urllib.request.urlopen(url, timeout=60) as answer:
                 return answer.status, answer.read().decode()
         except urllib.error.HTTPError as error:
             return error.code, error.read().decode()
@@ -260,7 +260,7 @@ async def test_only_so_many_readers_of_metrics_are_answered(watched: Server) -> 
         await get(watched, "/livez")
     for _, writer in slow:
         writer.close()
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(60):
         while True:
             with contextlib.suppress(urllib.error.URLError, OSError, http.client.HTTPException):
                 assert (await get(watched, "/livez"))[0] == 200

@@ -16,7 +16,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from magicslam.v1 import session_service_pb2 as session_pb
 from magicslam.v1 import session_service_pb2_grpc as session_grpc
 
-from magic_agent.client import MagicClient
+from magic_agent.client import ClientConfig, MagicClient
 from magic_core.errors import (
     ConfigError,
     DescriptorModelMismatch,
@@ -132,7 +132,7 @@ async def test_pages_hold_everything_once_in_order(server: Server, client: Magic
             request = session_pb.ListAgentsRequest(
                 session="sessions/room", page_size=2, page_token=token
             )
-            page = await stub.ListAgents(request, timeout=20)
+            page = await stub.ListAgents(request, timeout=60)
             found += [agent.name.rpartition("_")[2] for agent in page.agents]
             token, pages = page.next_page_token, pages + 1
         assert (found, pages) == (["0", "1", "2", "3", "4"], 3)
@@ -141,7 +141,7 @@ async def test_pages_hold_everything_once_in_order(server: Server, client: Magic
             session_pb.ListAgentsRequest(session="sessions/room", page_token="nonsense"),
         ):
             with pytest.raises(grpc.RpcError) as caught:
-                await stub.ListAgents(request, timeout=20)
+                await stub.ListAgents(request, timeout=60)
             assert isinstance(error_of(caught.value), InvalidInput)
 
 
@@ -168,13 +168,13 @@ async def test_health_and_reflection_know_every_service(server: Server) -> None:
     async with grpc.aio.insecure_channel(server.address) as channel:
         health = health_pb2_grpc.HealthStub(channel)
         for name in ("", *SERVICES):
-            answer = await health.Check(health_pb2.HealthCheckRequest(service=name), timeout=20)
+            answer = await health.Check(health_pb2.HealthCheckRequest(service=name), timeout=60)
             assert answer.status == health_pb2.HealthCheckResponse.SERVING
         stub = reflection_pb2_grpc.ServerReflectionStub(channel)
         asked = [reflection_pb2.ServerReflectionRequest(list_services="")] + [
             reflection_pb2.ServerReflectionRequest(file_containing_symbol=name) for name in SERVICES
         ]
-        answers = [answer async for answer in stub.ServerReflectionInfo(iter(asked), timeout=20)]
+        answers = [answer async for answer in stub.ServerReflectionInfo(iter(asked), timeout=60)]
         listed = {service.name for service in answers[0].list_services_response.service}
         assert {*SERVICES, "grpc.health.v1.Health"} <= listed
         for name, answer in zip(SERVICES, answers[1:], strict=True):
@@ -201,8 +201,6 @@ async def test_every_rpc_has_a_client_method() -> None:
 
 
 async def test_a_client_without_a_server_says_where_it_looked(unused_tcp_port: int) -> None:
-    from magic_agent.client import ClientConfig
-
     target = f"127.0.0.1:{unused_tcp_port}"
     with pytest.raises(Unavailable, match=target):
         async with MagicClient(target, ClientConfig(connect_timeout_s=0.3)):
@@ -214,7 +212,8 @@ async def test_idempotent_calls_wait_for_a_server_that_comes_back(
 ) -> None:
     first = Server(server_config)
     await first.start()
-    async with MagicClient(first.address) as client:
+    patient = ClientConfig(attempts=1000, max_backoff_s=0.5)
+    async with MagicClient(first.address, patient) as client:
         await register(client)
         await first.stop()
         listen = ListenConfig(port=first.port)
