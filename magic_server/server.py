@@ -98,7 +98,13 @@ class Server:
         )
         shared = {"jobs": self._jobs, "threads": self._threads, "config": config}
         self.sessions = Sessions(self._store, metrics=self.metrics, **shared)
-        self._maps = GlobalMaps(self._store, self.sessions, **shared)
+        self._maps = GlobalMaps(
+            self._store,
+            self.sessions,
+            jobs=self._jobs,
+            threads=self._store.blob_threads,
+            config=config,
+        )
         self._leasing: Leasing | None = None
         if self._store.leases is not None:
             self._leasing = Leasing(
@@ -112,7 +118,7 @@ class Server:
             self._store,
             self.sessions,
             jobs=self._jobs,
-            threads=self._threads,
+            threads=self._store.blob_threads,
             config=config.preview,
         )
         self.localizer = Localizer(self._store, **shared)
@@ -320,7 +326,7 @@ class Server:
             config=self.config,
         )
         mapping_grpc.add_MappingServiceServicer_to_server(mapping, server)
-        maps = GlobalMapServicer(self._store, self._maps, self._previews, threads=self._threads)
+        maps = GlobalMapServicer(self._store, self._maps, self._previews)
         map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
         sessions = SessionServicer(
             self._store,

@@ -37,6 +37,7 @@ class BucketServer:
         self.port = free_port()
         self.endpoint = f"http://127.0.0.1:{self.port}"
         self._server: ThreadedMotoServer | None = None
+        self._files: Any = None
 
     def start(self) -> None:
         """Begin to serve; waits until it does."""
@@ -79,10 +80,15 @@ class BucketServer:
         """A file system of its buckets."""
         import s3fs
 
-        return s3fs.S3FileSystem(
-            key=self.key, secret=self.secret, endpoint_url=self.endpoint, use_listings_cache=False,
-            skip_instance_cache=True,
-        )  # fmt: skip
+        if self._files is None:
+            self._files = s3fs.S3FileSystem(
+                key=self.key,
+                secret=self.secret,
+                endpoint_url=self.endpoint,
+                use_listings_cache=False,
+                skip_instance_cache=True,
+            )
+        return self._files
 
     def bucket(self) -> str:
         """The name of a new, empty bucket."""

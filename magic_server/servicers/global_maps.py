@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from concurrent.futures import Executor
 
 import grpc.aio
 from magicslam.v1 import global_map_service_pb2 as map_pb
@@ -26,13 +25,10 @@ DEFAULT_WAIT_S = 10.0
 class GlobalMapServicer(map_grpc.GlobalMapServiceServicer):
     """Builds and serves global maps."""
 
-    def __init__(
-        self, store: Store, maps: GlobalMaps, previews: Previews, *, threads: Executor
-    ) -> None:
+    def __init__(self, store: Store, maps: GlobalMaps, previews: Previews) -> None:
         self._store = store
         self._maps = maps
         self._previews = previews
-        self._threads = threads
 
     async def BuildGlobalMap(  # noqa: N802
         self, request: map_pb.BuildGlobalMapRequest, context: Context
@@ -109,6 +105,6 @@ class GlobalMapServicer(map_grpc.GlobalMapServiceServicer):
                 if map_id is not None:
                     raise
             else:
-                chunks = file_chunks(self._store.blobs, file.sha256, self._threads)
+                chunks = file_chunks(self._store.blobs, file.sha256, self._store.blob_threads)
                 return info, file.sha256, file.length, chunks
         return await self._previews.stream(session, kind)

@@ -44,7 +44,7 @@ class SessionServicer(session_grpc.SessionServiceServicer):
         self._removal = removal
         self._threads = threads
         self._limits = limits
-        self._archives = Archives(store, threads=threads, limits=limits.submap)
+        self._archives = Archives(store, threads=store.blob_threads, limits=limits.submap)
 
     async def GetSession(  # noqa: N802
         self, request: session_pb.GetSessionRequest, context: Context
@@ -164,7 +164,7 @@ class SessionServicer(session_grpc.SessionServiceServicer):
         yield session_pb.DownloadSubmapResponse(header=header)
         for position, blob in enumerate(header.blobs):
             async for chunk in file_chunks(
-                self._store.blobs, blob.sha256.hex(), self._threads, blob_index=position
+                self._store.blobs, blob.sha256.hex(), self._store.blob_threads, blob_index=position
             ):
                 yield session_pb.DownloadSubmapResponse(chunk=chunk)
 

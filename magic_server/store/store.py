@@ -12,7 +12,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -47,6 +47,8 @@ from magic_server.upload_config import PartialUploadLimits
 
 logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
+BUCKET_THREADS = 8
+"""Requests to a bucket that the server waits for at a time; each may be for many blobs."""
 
 
 class Store:
@@ -86,7 +88,10 @@ class Store:
         else:
             self.blobs = BlobFolder(folder)
         self.uploads = UploadFolder(self.scratch)
-        self._threads = threads
+        # A bucket that is silent holds up whoever asks it, and nobody else.
+        self.blob_threads: Executor = threads
+        if self.bucket is not None:
+            self.blob_threads = ThreadPoolExecutor(BUCKET_THREADS, "magic-bucket")
         self._partial_uploads = partial_uploads or PartialUploadLimits()
         self._database = Database(engine)
         self._commit_lock = SharedCommitLock(self._database) if engine.shared else CommitLock()
@@ -104,10 +109,10 @@ class Store:
         self.usage = UsageTable(self._database)
         self.archive = ArchiveTable(self._database)
         self._commits = SubmapCommits(
-            self.submaps, self.blobs, lock=self._commit_lock, threads=threads
+            self.submaps, self.blobs, lock=self._commit_lock, threads=self.blob_threads
         )
         self.deletions = Deletions(
-            self._database, self.blobs, lock=self._commit_lock, threads=threads
+            self._database, self.blobs, lock=self._commit_lock, threads=self.blob_threads
         )
 
     async def __aenter__(self) -> Self:
@@ -174,6 +179,8 @@ class Store:
         """Close the database and give the folder free."""
         await self._commits.close()
         await self._database.close()
+        if self.bucket is not None:
+            await asyncio.to_thread(self.blob_threads.shutdown)
         while self._lock_files:
             os.close(self._lock_files.pop())
 
@@ -203,7 +210,7 @@ class Store:
         now: float,
     ) -> None:
         """Make a merged map durable and its operation done."""
-        await self.blobs.bring(written, self._threads)
+        await self.blobs.bring(written, self.blob_threads)
         async with self._commit_lock:
             fresh = await self._in_thread(self.blobs.adopt, written)
             try:
@@ -221,7 +228,7 @@ class Store:
         written: Sequence[WrittenBlob],
     ) -> Imported:
         """Make a checked archive durable: all of its session, or nothing."""
-        await self.blobs.bring(written, self._threads)
+        await self.blobs.bring(written, self.blob_threads)
         async with self._commit_lock:
             fresh = await self._in_thread(self.blobs.adopt, written)
             try:
@@ -254,7 +261,9 @@ class Store:
             return await self._in_thread(remove)
 
     async def _in_thread(self, function: Callable[..., _T], *arguments: Any) -> _T:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+        return await asyncio.get_running_loop().run_in_executor(
+            self.blob_threads, function, *arguments
+        )
 
 
 async def _refers_to_blobs(connection: AsyncConnection) -> bool:
