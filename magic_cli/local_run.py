@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import shutil
 import signal
 import time
@@ -31,7 +30,7 @@ SESSION = "run"
 SERVER_START_TIMEOUT_S = 120.0
 RPC_TIMEOUT_S = 120.0
 """Our own server on this machine may be slow when the machine is busy, but it is not away."""
-VIEWER_START_TIMEOUT_S = 60.0
+VIEWER_START_TIMEOUT_S = 120.0
 VIEWER_STOP_TIMEOUT_S = 60.0
 
 
@@ -95,12 +94,12 @@ class LocalRun:
         if not config.viewer and config.rerun is None:
             return
         arguments = ["view", target, "--session", SESSION, "--progress", "json"]
-        arguments += ["--port", str(config.viewer_port)] if config.viewer else ["--no-page"]
+        page = ["--port", str(config.viewer_port), "--max-splats", str(config.viewer_splats)]
+        arguments += page if config.viewer else ["--no-page"]
         arguments += ["--rerun", str(config.rerun)] if config.rerun is not None else []
         log = self._folder.server_folder / "view-log.txt"
         self._viewer = await processes.start("viewer", arguments, log=log, threads=1)
-        with contextlib.suppress(AttributeError, OSError):  # a courtesy not every system has
-            os.setpriority(os.PRIO_PROCESS, self._viewer.process.pid, 5)
+        processes.give_way(self._viewer.process.pid)
         ready = await processes.wait_ready(self._viewer, timeout_s=VIEWER_START_TIMEOUT_S)
         if ready["page"] is not None:
             progress.say(f"Open {ready['page']} in a browser to watch.")

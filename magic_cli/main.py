@@ -44,7 +44,7 @@ EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point. Exits 0 ok, 1 failed, 2 usage."""
+    """Entry point. Exits 0 ok, 1 failed, 2 usage, 130 interrupted."""
     sys.exit(run_command(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -87,4 +87,5 @@ def _usage() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items()]
     head = "usage: magic COMMAND [options]     (magic COMMAND --help for one command)"
-    return "\n".join([head, "", *lines, "", "Start with: magic demo"])
+    codes = "Exit codes: 0 done, 1 failed (the reason is printed), 2 wrong options, 130 interrupted"
+    return "\n".join([head, "", *lines, "", "Start with: magic demo", codes])

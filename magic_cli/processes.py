@@ -18,6 +18,8 @@ from magic_core.errors import Unavailable
 Progress = Callable[[str, dict], None]
 """Called with a child's name and the newest figures it printed."""
 
+_BELOW_US = 5
+"""Steps of niceness."""
 STREAM_LIMIT_BYTES = 1 << 20
 
 
@@ -68,6 +70,13 @@ async def start(name: str, arguments: list[str], *, log: Path, threads: int) -> 
             start_new_session=True,
         )  # fmt: skip
     return Child(name=name, process=process, log=log)
+
+
+def give_way(pid: int) -> None:
+    """Lower the priority of a child below our own: what it does can wait."""
+    with contextlib.suppress(AttributeError, OSError):  # a courtesy that not every system has
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, pid, min(own + _BELOW_US, 19))
 
 
 async def follow(child: Child, progress: Progress) -> int:

@@ -66,6 +66,8 @@ class RunConfig(AgentConfig):
     """Show the map in the browser while it grows; `magic view RUN` shows it again afterwards."""
     viewer_port: int = 8080
     """Port of the page, on this machine alone; the next free one where it is taken."""
+    viewer_splats: int = 1_000_000
+    """Gaussians sent to the browser at most; without a GPU 100000 are drawn smoothly."""
     rerun: Path | None = None
     """Write the run to this Rerun recording (.rrd) as it goes; needs the extra `rerun`."""
     lpips_weights: Path | None = None

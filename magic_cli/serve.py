@@ -12,7 +12,6 @@ Examples:
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import subprocess
@@ -22,6 +21,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from magic_cli import processes
 from magic_cli.options import parse
 from magic_cli.output import console
 from magic_cli.systemd import notify
@@ -40,6 +40,8 @@ class ServeCommand(ServerConfig):
     """Serve the live view too, as a process of its own: `magic view` on this server."""
     viewer_port: int = 8080
     """Port of the live view; the next free one where it is taken."""
+    viewer_splats: int = 1_000_000
+    """Gaussians sent to the browser at most; without a GPU 100000 are drawn smoothly."""
     progress: Literal["text", "json"] = "text"
     """`json` prints one line with the address on stdout once the server is ready."""
 
@@ -76,7 +78,7 @@ def main(arguments: list[str]) -> int:
                 console.print(f"Metrics at http://{server.metrics_address}/metrics", markup=False)
 
         if command.viewer:
-            viewers.append(_start_viewer(target, command.viewer_port))
+            viewers.append(_start_viewer(target, command))
 
     viewers: list[subprocess.Popen] = []
     try:
@@ -88,10 +90,10 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _start_viewer(target: str, port: int) -> subprocess.Popen:
+def _start_viewer(target: str, command: ServeCommand) -> subprocess.Popen:
     """The live view of this server, at low priority: watching never slows the run."""
-    arguments = [sys.executable, "-m", "magic_cli", "view", target, "--port", str(port)]
+    page = ["--port", str(command.viewer_port), "--max-splats", str(command.viewer_splats)]
+    arguments = [sys.executable, "-m", "magic_cli", "view", target, *page]
     viewer = subprocess.Popen(arguments, stdin=subprocess.DEVNULL)
-    with contextlib.suppress(AttributeError, OSError):  # a courtesy that not every system has
-        os.setpriority(os.PRIO_PROCESS, viewer.pid, 5)
+    processes.give_way(viewer.pid)
     return viewer

@@ -11,9 +11,14 @@ def print_summary(metrics: dict, folder: RunFolder) -> None:
     console.print(_accuracy(metrics))
     console.print(_map_quality(metrics))
     console.print(table("Run", ["", "value"], _facts(metrics)))
-    console.print(f"Report: {folder.report_path}", highlight=False, soft_wrap=True)
-    console.print(f"Map:    {folder.map_path}  (opens in SuperSplat and other 3DGS viewers)",
-                  highlight=False, soft_wrap=True)  # fmt: skip
+    if folder.report_path.is_file():
+        _say(f"Report: {folder.report_path}")
+    _say(f"Map:    {folder.map_path}  (opens in SuperSplat and other 3DGS viewers)")
+    _say(f"Look:   magic view {folder.path}")
+
+
+def _say(line: str) -> None:
+    console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def _accuracy(metrics: dict):

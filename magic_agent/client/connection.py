@@ -42,8 +42,8 @@ class ClientConfig:
     """How long `connect` waits for the server."""
     rpc_timeout_s: float = 20.0
     """Deadline of one ordinary call, seconds."""
-    localize_timeout_s: float = 60.0
-    """Deadline of placing one image in the map, seconds."""
+    localize_timeout_s: float = 180.0
+    """Deadline of placing one image in the map, seconds; the first also waits for a worker."""
     submit_timeout_s: float = 300.0
     """Deadline of one attempt to send a sub-map, seconds."""
     download_timeout_s: float = 600.0

@@ -1,4 +1,4 @@
-"""The lines of the scene: trajectories and loops, drawn anew only when they changed."""
+"""The lines of the scene: trajectories with names, and loops, drawn anew when they changed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from magic_cli.viewer.colours import colour_of, loop_colour, on_surface
 from magic_cli.viewer.model import Pose, SessionView
 from magic_core.wire.records import LoopCandidate
 
-LineLayer = Literal["paths", "tracked paths", "accepted loops", "rejected loops"]
+LineLayer = Literal["paths", "names", "tracked paths", "accepted loops", "rejected loops"]
 _VERDICT: dict[LineLayer, str] = {"accepted loops": "ACCEPTED", "rejected loops": "REJECTED"}
 
 _OCTAHEDRON = np.array(
@@ -46,7 +46,9 @@ class Lines:
         tracked = view.tracked()
         for agent in view.agent_names():
             colour = np.array(colour_of(agent))
-            self._draw_path("paths", agent, view.world_from_cameras(agent, anchors), colour)
+            corrected = view.world_from_cameras(agent, anchors)
+            self._draw_path("paths", agent, corrected, colour)
+            self._draw_name(agent, corrected)
             before = view.world_from_cameras(agent, tracked)
             self._draw_path("tracked paths", agent, before, colour // 2)
         loops = [c for c in view.loops if c.source in anchors and c.target in anchors]
@@ -69,6 +71,18 @@ class Lines:
         points = _segments([part[:, :3, 3] for part in parts])
         if self._is_new((layer, agent), points, colour):
             self._draw_lines((layer, agent), points, colour)
+
+    def _draw_name(self, agent: str, parts: list[NDArray]) -> None:
+        """An agent's name, where it was last."""
+        key: tuple[LineLayer, str] = ("names", agent)
+        place = parts[-1][-1][:3, 3] if parts else np.zeros(0)
+        if len(place) == 0 or not self._is_new(key, place):
+            return
+        if key not in self._handles:
+            self._handles[key] = self._server.scene.add_label(
+                f"/names/{agent}", agent, anchor="bottom-center"
+            )
+        self._handles[key].position = tuple(place)
 
     def _draw_loops(
         self, layer: LineLayer, loops: list[LoopCandidate], anchors: dict[str, Pose]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magic_cli.viewer.model import Pose, SessionView
 from magic_cli.viewer.panel import Panel
 from magic_cli.viewer.scene import Scene
-from magic_cli.viewer.vantage import outside
+from magic_cli.viewer.vantage import FIELD_OF_VIEW_RAD, Vector, outside
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import se3
 
@@ -31,8 +31,11 @@ class Page:
         self._render_lock = threading.Lock()
         self._view: SessionView | None = None
         self._rasteriser: Any = None
-        self._placed_for = 0
-        """How many sub-maps there were when newcomers' view was chosen."""
+        self._placed_for = (0, 0)
+        """How many sub-maps and components there were when the view of the whole was chosen."""
+        self._whole_from: Vector | None = None
+        """Where that view stands: a visitor who is there has not moved, and goes on seeing all."""
+        self._server.initial_camera.fov = FIELD_OF_VIEW_RAD
         self._panel = Panel(
             self._server,
             render=self._rendered,
@@ -58,9 +61,10 @@ class Page:
             self._view = view
             self._scene.update(view)
             self._panel.update(view)
-            if len(view.submaps) != self._placed_for:
-                self._place_cameras(view, everyone=self._placed_for == 0)
-                self._placed_for = len(view.submaps)
+            size = len(view.submaps), len(view.snapshot.components) if view.snapshot else 0
+            if size != self._placed_for:
+                self._place_cameras(view)
+                self._placed_for = size
             self._follow(view)
 
     def close(self) -> None:
@@ -68,27 +72,30 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def _place_cameras(self, view: SessionView, *, everyone: bool) -> None:
-        """New visitors see the whole map; so does everyone who waited for its first part."""
+    def _place_cameras(self, view: SessionView) -> None:
+        """New visitors see the whole map; so do those who have not moved since they saw it."""
         anchors = view.world_from_anchor()
         if not anchors:
             return
-        position, look_at, _ = outside(view, anchors)
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = tuple(position), tuple(look_at)
-        if everyone:
-            for client in self._server.get_clients().values():
-                client.camera.position, client.camera.look_at = tuple(position), tuple(look_at)
+        position, look_at = outside(view, anchors, self._scene.up)
+        unmoved = [
+            client
+            for client in self._server.get_clients().values()
+            if _is_at(client.camera, self._whole_from)
+        ]
+        for camera in (self._server.initial_camera, *(client.camera for client in unmoved)):
+            camera.position, camera.look_at = position, look_at
+        self._whole_from = position
 
     def _see_everything(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            anchors = self._view.world_from_anchor() if self._view else {}
-            if self._view is None or not anchors:
+            if self._view is None or not self._view.world_from_anchor():
                 return
-            position, look_at, up = outside(self._view, anchors)
+            self._place_cameras(self._view)
+            whole, up = self._server.initial_camera, self._scene.up
         with client.atomic():
             client.camera.up_direction = tuple(up)
-            client.camera.position, client.camera.look_at = tuple(position), tuple(look_at)
+            client.camera.position, client.camera.look_at = whole.position, whole.look_at
 
     def _follow(self, view: SessionView) -> None:
         """Put every visitor's camera behind the followed agent's newest frame."""
@@ -126,6 +133,14 @@ class Page:
             at = pose.world_from_anchor @ submap.keyframes[keyframe].anchor_from_camera
             view = self._rasteriser.render(_joined(parts), submap.camera, at)
         return (np.clip(view.colour, 0.0, 1.0) * 255).astype(np.uint8)
+
+
+def _is_at(camera: viser.CameraHandle, place: Vector | None) -> bool:
+    """Whether a visitor's camera stands at a place; so do all while there is no place yet."""
+    if place is None:
+        return True
+    reach = np.linalg.norm(np.asarray(camera.look_at) - camera.position)
+    return bool(np.linalg.norm(np.asarray(camera.position) - place) < 0.01 * reach)
 
 
 def _parts_of(view: SessionView, component: str) -> list[tuple[GaussianCloud, Pose]]:

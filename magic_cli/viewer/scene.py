@@ -24,8 +24,8 @@ from magic_core.wire.records import LoopCandidate
 
 Layer = Literal["splats", "ceiling", "anchors", "keyframes"] | LineLayer
 LAYERS: tuple[Layer, ...] = (
-    "splats", "ceiling", "paths", "tracked paths", "anchors", "keyframes", "accepted loops",
-    "rejected loops",
+    "splats", "ceiling", "paths", "names", "tracked paths", "anchors", "keyframes",
+    "accepted loops", "rejected loops",
 )  # fmt: skip
 HIDDEN_AT_FIRST: frozenset[Layer] = frozenset({"ceiling", "tracked paths", "keyframes"})
 
@@ -65,6 +65,11 @@ class Scene:
         self._replaced: frozenset[str] = frozenset()
         """Sub-maps whose component is shown as a merged map."""
         server.scene.set_background_image(np.full((2, 2, 3), (22, 26, 34), np.uint8))
+
+    @property
+    def up(self) -> Vector:
+        """Unit (3,) up of the picture; y against gravity as cameras have it until one was seen."""
+        return np.array([0.0, -1.0, 0.0]) if self._up is None else self._up
 
     @property
     def shown_splats(self) -> int:

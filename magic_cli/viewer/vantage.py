@@ -14,8 +14,13 @@ Vector = NDArray[np.float64]
 _ABOVE_M = 0.7
 """Higher than this above the nearest camera, metres: a ceiling, for cameras held by people."""
 _ELEVATION_RAD = np.deg2rad(50.0)
-_BACK_OFF = 2.1
-_BESIDE_PANEL = 0.3
+FIELD_OF_VIEW_RAD = np.deg2rad(50.0)
+"""Vertical, of the page's camera."""
+_ASPECT = 1.6
+_BESIDE_PANEL = 0.7
+"""The share of the page's width that the panel leaves free, at its left."""
+_MARGIN = 1.08
+_NEAREST_M = 1.0
 _EVERY_MEAN = 16
 
 
@@ -32,29 +37,54 @@ def above(points: NDArray, cameras: NDArray, up: Vector) -> NDArray[np.bool_]:
     return (points - cameras[nearest]) @ up > _ABOVE_M
 
 
-def outside(view: SessionView, anchors: dict[str, Pose]) -> tuple[Vector, Vector, Vector]:
-    """(position, look_at, up) of a view that holds the map and the agents, from above.
+def outside(view: SessionView, anchors: dict[str, Pose], up: Vector) -> tuple[Vector, Vector]:
+    """(position, look_at) of a view from above that holds the map and the agents.
 
-    It looks the way the agents looked on average, as far as that is level.
+    It looks the way the agents looked on average, as far as that is level, and leaves the right of
+    the page to the panel.
     """
-    up = up_of(view, anchors)
-    points = np.concatenate(
-        [
-            part
-            for name, pose in anchors.items()
-            for part in (
-                se3.transform_points(pose, view.submaps[name].cloud.means[::_EVERY_MEAN]),
-                (pose @ view.submaps[name].path)[:, :3, 3],
-            )
-        ]
-    )
-    centre = np.median(points, axis=0)
-    reach = max(1.0, float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.9)))
+    points = _points(view, anchors, up)
     ahead = _level(np.stack([pose[:3, 2] for pose in anchors.values()]).mean(axis=0), up)
-    away = np.sin(_ELEVATION_RAD) * up - np.cos(_ELEVATION_RAD) * ahead
-    # The panel covers the right of the page, so the map is put to the left of its middle.
-    target = centre + _BESIDE_PANEL * reach * np.cross(ahead, up)
-    return target + _BACK_OFF * reach * away, target, up
+    forward = np.cos(_ELEVATION_RAD) * ahead - np.sin(_ELEVATION_RAD) * up
+    right = np.cross(ahead, up)
+    axes = np.stack([right, np.cross(right, forward), forward])  # rows: right, upwards, forward
+    position, depth = _fitted(points @ axes.T)
+    return position @ axes, position @ axes + depth * forward
+
+
+def _points(view: SessionView, anchors: dict[str, Pose], up: Vector) -> Vector:
+    """(n, 3) some of what is seen: Gaussians below the ceiling, and where cameras stood."""
+    parts = []
+    for name, pose in anchors.items():
+        submap = view.submaps[name]
+        some = np.asarray(submap.cloud.means[::_EVERY_MEAN], np.float64)
+        path = submap.path[:, :3, 3]
+        hidden = above(some, path, pose[:3, :3].T @ up) if len(some) else np.zeros(0, bool)
+        parts += [se3.transform_points(pose, p) for p in (some[~hidden], path)]
+    return np.concatenate(parts)
+
+
+def _fitted(points: Vector) -> tuple[Vector, float]:
+    """Where to stand to see (n, 3) points, x right, y up, z forward, and how far away most are.
+
+    A point lies within the page's left border if -(x - px) <= left * (z - pz), and so on: with the
+    outermost points of each border that gives the position. One in a hundred may lie outside, since
+    stray Gaussians would shrink all others.
+    """
+    x, y, z = points.T
+    height = float(np.tan(FIELD_OF_VIEW_RAD / 2)) / _MARGIN
+    left, right = _ASPECT * height, _ASPECT * height * (2.0 * _BESIDE_PANEL - 1.0)
+
+    def outermost(across: Vector, slope: float) -> float:
+        return float(np.quantile(across - slope * z, 0.99))
+
+    on_the_right, on_the_left = outermost(x, right), outermost(-x, left)
+    above_it, below_it = outermost(y, height), outermost(-y, height)
+    back = max((on_the_right + on_the_left) / (left + right), (above_it + below_it) / (2 * height))
+    back = max(back, _NEAREST_M - float(np.quantile(z, 0.01)))
+    across = (on_the_right - right * back + left * back - on_the_left) / 2
+    upwards = (above_it - below_it) / 2
+    return np.array([across, upwards, -back]), back + float(np.median(z))
 
 
 def _level(direction: Vector, up: Vector) -> Vector:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import shutil
@@ -16,10 +17,19 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 ARTEFACTS = Path(__file__).resolve().parents[2] / "build" / "viewer"
 SLOW_MS = 180_000
 BACKGROUND = np.array([22, 26, 34])
+WIDTH, HEIGHT = 1440, 900
+MAP_AREA = (0, 0, 1000, HEIGHT)
+"""Left, top, right, bottom of what lies beside the panel."""
+MARKS = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (apt-get install chromium)"),
+    pytest.mark.slow,
+]
+"""Of every test of a page: `pytestmark = MARKS`."""
 
 
 @contextlib.asynccontextmanager
-async def page_in_chromium(address: str, *, width: int, height: int) -> AsyncIterator:
+async def page_in_chromium(address: str) -> AsyncIterator:
     """The page at an address, with software rendering."""
     playwright = pytest.importorskip("playwright.async_api")
     async with playwright.async_playwright() as driver:
@@ -29,7 +39,7 @@ async def page_in_chromium(address: str, *, width: int, height: int) -> AsyncIte
                   "--ignore-gpu-blocklist", "--disable-quic"],
         )  # fmt: skip
         try:
-            tab = await chromium.new_page(viewport={"width": width, "height": height})
+            tab = await chromium.new_page(viewport={"width": WIDTH, "height": HEIGHT})
             tab.set_default_timeout(SLOW_MS)
             await tab.goto(address)
             await tab.wait_for_selector("canvas")
@@ -40,10 +50,10 @@ async def page_in_chromium(address: str, *, width: int, height: int) -> AsyncIte
 
 async def dismiss_notices(tab) -> None:
     """Close what lies over the picture, such as the notice that no GPU renders."""
-    notices = tab.locator(".mantine-Notification-root button")
-    while await notices.count():
-        await notices.first.click()
-        await tab.wait_for_timeout(300)
+    await tab.evaluate(
+        "document.querySelectorAll('.mantine-Notification-root button').forEach(b => b.click())"
+    )
+    await tab.wait_for_function("!document.querySelector('.mantine-Notification-root')")
 
 
 async def says(tab, text: str) -> None:
@@ -63,3 +73,14 @@ def shown_share(picture: np.ndarray, area: tuple[int, int, int, int]) -> float:
     left, top, right, bottom = area
     part = picture[top:bottom, left:right].astype(int)
     return float((np.abs(part - BACKGROUND).max(axis=2) > 25).mean())
+
+
+async def settled_share(tab, name: str, *, least: float = 0.0, most: float = 1.0) -> float:
+    """The share of the map's area that is drawn, once it lies in a range; keeps the picture."""
+    share = -1.0
+    for _ in range(40):
+        share = shown_share(await screenshot(tab, name), MAP_AREA)
+        if least <= share <= most:
+            break
+        await asyncio.sleep(1.0)
+    return share

@@ -122,28 +122,48 @@ class Reader:
 
     def _run_script(self, lines: list[str], *, where: str) -> None:
         if lines:
-            self._run(["bash", "-euo", "pipefail", "-c", "\n".join(lines)], where=where)
+            # -x: the last command that is shown is the one that failed
+            self._run(["bash", "-xeuo", "pipefail", "-c", "\n".join(lines)], where=where)
             lines.clear()
 
     def _run(self, command: list[str], *, where: str) -> None:
-        done = subprocess.run(
+        """Run a command to its end; a failure shows what it printed, and what servers did."""
+        process = subprocess.Popen(
             command, cwd=self.folder, env=self._environment, stdin=subprocess.DEVNULL, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=PATIENCE_S, check=False,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
-        assert done.returncode == 0, f"{where}: {command[-1]}\n{done.stdout[-4000:]}"
+        try:
+            printed, _ = process.communicate(timeout=PATIENCE_S)
+            ended = f"exit code {process.returncode}"
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            printed, _ = process.communicate()
+            ended = f"not done after {PATIENCE_S} s"
+        assert ended == "exit code 0", f"{where}: {ended}\n{printed[-6000:]}\n{self._server_logs()}"
 
     def _start(self, line: str, *, where: str) -> None:
         name = " ".join(line.split()[:2])
         self._stop(name)  # a page that starts another server means this one
-        process = subprocess.Popen(
-            ["bash", "-c", f"exec {line.split('#')[0]}"], cwd=self.folder, env=self._environment,
-            stdout=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
+        log = self._log_of(name)
+        with log.open("w") as messages:
+            process = subprocess.Popen(
+                ["bash", "-c", f"exec {line.split('#')[0]}"], cwd=self.folder,
+                env=self._environment, stdout=subprocess.PIPE, stderr=messages, text=True,
+                start_new_session=True,
+            )  # fmt: skip
         self._staying[name] = process
         assert process.stdout is not None
         first = process.stdout.readline()
-        assert first, f"{where}: {line} ended at once with {process.wait()}"
+        assert first, f"{where}: {line} ended at once with {process.wait()}\n{log.read_text()}"
         assert json.loads(first)["ready"], where
+
+    def _log_of(self, name: str) -> Path:
+        return self.folder / f"{name.replace(' ', '-')}.log"
+
+    def _server_logs(self) -> str:
+        """How the logs of what stays end."""
+        parts = [f"== {name}\n{self._log_of(name).read_text()[-3000:]}" for name in self._staying]
+        return "\n".join(parts)
 
     def _stop(self, name: str) -> None:
         process = self._staying.pop(name, None)
