@@ -3,7 +3,8 @@
 A heartbeat runs in the loop every few milliseconds. When one comes late, the gap is a stall of the
 loop, less the time in which the machine gave its processors to others: on Linux the scheduler says
 how long each thread was ready to run but did not, and the loop can be held up by its own thread or
-by one that was put aside while holding the interpreter lock.
+by one that was put aside while holding the interpreter lock. Nor is it a stall when the process as
+a whole was stopped: no thread of it came to run, and no processor time was used.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ class LoopMonitor:
         self._thread_id = 0
         self._began = 0.0
         self._last_beat = 0.0
-        self._seen = ""
+        self._last_look = 0.0
+        self._unseen_s = 0.0
+        self._seen: traceback.StackSummary | None = None
         self._gc_started = 0.0
         self._gc_s = 0.0
 
@@ -82,7 +85,7 @@ class LoopMonitor:
     def start(self) -> None:
         """Watch the running loop from now on."""
         self._thread_id = threading.get_ident()
-        self._began = self._last_beat = time.perf_counter()
+        self._began = self._last_beat = self._last_look = time.perf_counter()
         gc.callbacks.append(self._on_gc)
         self._watcher = threading.Thread(target=self._watch, name="loop-watcher", daemon=True)
         self._watcher.start()
@@ -100,19 +103,24 @@ class LoopMonitor:
         await asyncio.to_thread(self._watcher.join)
 
     async def _beat(self) -> None:
-        waits, cpu = _waits(), time.thread_time()
+        waits, cpu, all_cpu = _waits(), time.thread_time(), time.process_time()
         while True:
             self._gc_s = 0.0
             self._last_beat = started = time.perf_counter()
             await asyncio.sleep(self._interval_s)
             gap = time.perf_counter() - started - self._interval_s
             self.beats += 1
-            if gap > self.threshold_s:
+            if gap > self.threshold_s and not self._was_stopped(gap, all_cpu):
                 self._record(gap, waits, cpu)
             if gap > self.threshold_s or self.beats % 8 == 0:
                 waits = _waits()
-            cpu = time.thread_time()
-            self._seen = ""
+            cpu, all_cpu = time.thread_time(), time.process_time()
+            self._seen, self._unseen_s = None, 0.0
+
+    def _was_stopped(self, gap: float, all_cpu: float) -> bool:
+        """Whether the whole process stood still: signals, or a machine that was put to sleep."""
+        unseen_s = max(self._unseen_s, time.perf_counter() - self._last_look)
+        return unseen_s > 0.9 * gap and time.process_time() - all_cpu < 0.05 * gap
 
     def _record(self, gap: float, waits: dict[str, float], cpu: float) -> None:
         now = _waits()
@@ -124,7 +132,8 @@ class LoopMonitor:
             return
         used = time.thread_time() - cpu
         at_s = time.perf_counter() - self._began
-        stall = Stall(at_s, seconds, gap, waited, used, self._gc_s, self._seen)
+        stack = "".join(self._seen.format()) if self._seen else ""
+        stall = Stall(at_s, seconds, gap, waited, used, self._gc_s, stack)
         self.count += 1
         self.stalls = sorted([*self.stalls, stall], key=lambda s: -s.seconds)[:100]
         logger.warning("the event loop stood still for %.0f ms\n%s", seconds * 1e3, stall.stack)
@@ -132,16 +141,27 @@ class LoopMonitor:
     def _watch(self) -> None:
         """Look at the loop's thread whenever its heartbeat is late."""
         while not self._stop.wait(self.threshold_s / 4):
-            late = time.perf_counter() - self._last_beat - self._interval_s
+            now = time.perf_counter()
+            self._unseen_s = max(self._unseen_s, now - self._last_look)
+            self._last_look = now
+            late = now - self._last_beat - self._interval_s
             if late > self.threshold_s / 2 and not self._seen:
                 frame: FrameType | None = sys._current_frames().get(self._thread_id)
-                self._seen = "".join(traceback.format_stack(frame, limit=12)) if frame else ""
+                self._seen = _stack_of(frame) if frame else None
 
     def _on_gc(self, phase: str, _info: dict[str, int]) -> None:
         if phase == "start":
             self._gc_started = time.perf_counter()
         elif threading.get_ident() == self._thread_id:
             self._gc_s += time.perf_counter() - self._gc_started
+
+
+def _stack_of(frame: FrameType) -> traceback.StackSummary:
+    """The innermost frames; their lines are read from the files when they are wanted."""
+    frames = traceback.walk_stack(frame)
+    found = traceback.StackSummary.extract(frames, limit=12, lookup_lines=False)
+    found.reverse()
+    return found
 
 
 def _waits() -> dict[str, float]:

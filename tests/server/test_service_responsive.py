@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import gc
+import signal
 import statistics
 import sys
 import time
@@ -81,6 +82,32 @@ async def test_the_monitor_leaves_work_on_threads_alone(threshold_s: float) -> N
 
 async def test_a_monitor_that_never_began_stops() -> None:
     await LoopMonitor().stop()
+
+
+async def test_a_process_that_was_stopped_did_not_stall() -> None:
+    script = (
+        "import asyncio\n"
+        "from magic_server.loop_monitor import LoopMonitor\n"
+        "async def main():\n"
+        "    async with LoopMonitor(threshold_s=0.5) as monitor:\n"
+        "        print('watching', flush=True)\n"
+        "        await asyncio.to_thread(input)\n"
+        "        await asyncio.sleep(0.1)\n"
+        "    print(monitor.count)\n"
+        "asyncio.run(main())\n"
+    )
+    watched = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", script, cwd=REPOSITORY,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    assert watched.stdout is not None
+    await watched.stdout.readline()
+    await asyncio.sleep(0.2)
+    watched.send_signal(signal.SIGSTOP)
+    await asyncio.sleep(2.0)
+    watched.send_signal(signal.SIGCONT)
+    output, _ = await watched.communicate(b"\n")
+    assert int(output) == 0
 
 
 async def test_no_stall_while_large_submaps_arrive_and_loops_are_solved(
