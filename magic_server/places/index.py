@@ -6,7 +6,7 @@ the FAISS index that is fast at a million vectors and still supports removal (HN
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from magic_core.errors import AlreadyExists, InvalidInput, NotFound
 EXACT_LIMIT = 100_000
 TRAINING_VECTORS_PER_LIST = 50
 LISTS_PROBED = 32
+LOADED_AT_ONCE = 10_000
 BLAS_THRESHOLD = 3072
 """FAISS skips BLAS for small batches of long vectors, which is 18 times slower at 384 numbers."""
 
@@ -61,6 +62,25 @@ class DescriptorIndex:
         self._name_of[identifier] = name
         if self._is_exact and len(self) > self._exact_limit:
             self._become_inverted_file()
+
+    def load(self, names: Sequence[str], vectors: Sequence[ArrayLike]) -> None:
+        """Store many (dimension,) at once: one by one, a million take an inverted file minutes.
+
+        Raises AlreadyExists for a known name, before anything is stored.
+        """
+        known = set(names)
+        if len(known) < len(names) or not known.isdisjoint(self._id_of):
+            raise AlreadyExists("descriptors under one name twice, or in the index already")
+        for first in range(0, len(names), LOADED_AT_ONCE):
+            chunk = names[first : first + LOADED_AT_ONCE]
+            rows = [self._unit_row(v) for v in vectors[first : first + LOADED_AT_ONCE]]
+            identifiers = np.arange(self._next_id, self._next_id + len(chunk))
+            self._index.add_with_ids(np.concatenate(rows), identifiers)
+            self._next_id += len(chunk)
+            self._id_of.update(zip(chunk, identifiers.tolist(), strict=True))
+            self._name_of.update(zip(identifiers.tolist(), chunk, strict=True))
+            if self._is_exact and len(self) > self._exact_limit:
+                self._become_inverted_file()
 
     def remove(self, name: str) -> None:
         """Forget a vector. Raises NotFound for an unknown name."""

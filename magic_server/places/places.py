@@ -45,8 +45,9 @@ class LocalPlaces:
 
     async def load(self, vectors: Sequence[Named]) -> None:
         """Hold these, and no others; the index must be new."""
-        for name, vector in vectors:
-            await self.add(name, vector)
+        names = [name for name, _ in vectors]
+        async with self._lock:
+            await self._in_thread(self._index.load, names, [vector for _, vector in vectors])
 
     async def add(self, name: str, vector: np.ndarray) -> None:
         """Hold one more; nothing happens when it is there."""

@@ -26,7 +26,7 @@ DAMPING = 1e-6
 """Added to each diagonal: a vertex that no edge holds in some direction stays where it is."""
 HELD = 1e12
 """Information that holds a vertex."""
-LIKENESS = 0.02
+LIKENESS = 0.002
 """Condensed matrices that differ by less, relative to their diagonals, do for a while."""
 STRAIN_M = 3e-4
 """What lies below separators that bend by less moves as one rigid body."""

@@ -29,8 +29,11 @@ Numbers = NDArray[np.int64]
 
 REGION = 48
 """At most so many sub-maps are condensed at once."""
-LARGE_M = 0.5
-"""A step that moves something by more is followed by exact ones: it was not quite linear."""
+SMALL_M = 0.01
+"""A step that moves something by more is followed by another: it was not quite linear."""
+LOCAL_ROUNDS = 3
+GOOD_STEP = 0.3
+"""A step larger than this share of the one before says that matrices are too old."""
 EXACT_SHARE = 0.02
 """After growing by this share, all that small steps left undone is taken in."""
 ARRIVED_M = 1e-4
@@ -48,6 +51,8 @@ class Settled:
     """Vertices whose poses changed, ascending."""
     strained: Numbers
     """Edges that were looked at again and whose squared norm reaches the limit, ascending."""
+    exact: bool
+    """Whether all that smaller steps had left undone was taken in."""
 
 
 class Hierarchy:
@@ -135,10 +140,17 @@ class Hierarchy:
         strained = self._refresh(poses, limit, fresh=True)
         if not exactly and self._unanswered < EXACT_SHARE * len(self._at):
             self._eliminate(poses, exactly=False)
-            step = self._fronts.step(self._tension.take_fresh(), poses, self._held)
-            moved.update(self._take(step, poses))
-            strained.update(self._refresh(poses, limit, fresh=False))
-            exactly = _size_m(step) > LARGE_M
+            last = np.inf
+            for _ in range(LOCAL_ROUNDS):
+                step = self._fronts.step(self._tension.fresh, poses, self._held)
+                moved.update(self._take(step, poses))
+                strained.update(self._refresh(poses, limit, fresh=True))
+                size = _size_m(step)
+                exactly = size > max(SMALL_M, GOOD_STEP * last)
+                if size < SMALL_M or exactly:
+                    break
+                last = size
+            self._tension.forget_fresh()
         else:
             exactly = True
         if exactly:
@@ -146,13 +158,14 @@ class Hierarchy:
             self._changed.update(n for n, home in enumerate(self._home) if home >= 0)
             strained = self._refresh(poses, limit, fresh=False)
         over = [n for n, is_over in strained.items() if is_over and self._home[n] >= 0]
-        return Settled(np.array(sorted(moved), np.int64), np.array(sorted(over), np.int64))
+        return Settled(np.array(sorted(moved), np.int64), np.array(sorted(over), np.int64), exactly)
 
     def _settle_exactly(self, poses: Array) -> set[int]:
         """Steps against all that is left of the gradient, until they are small."""
         moved: set[int] = set()
         self._unanswered = 0
-        self._tension.take_fresh()
+        self._tension.forget_fresh()
+        last = np.inf
         for _ in range(ROUNDS):
             self._changed.update(n for n, home in enumerate(self._home) if home >= 0)
             self._refresh(poses, np.inf, fresh=False)
@@ -160,8 +173,12 @@ class Hierarchy:
             gradient = dict(enumerate(self._tension.gradient))
             step = self._fronts.step(gradient, poses, self._held)
             moved.update(self._take(step, poses))
-            if _size_m(step) < ARRIVED_M:
+            size = _size_m(step)
+            if size < ARRIVED_M:
                 break
+            if size > GOOD_STEP * last:
+                self._stale.update(range(len(self._tree.nodes)))
+            last = size
         return moved
 
     def _refresh(self, poses: Array, limit: float, *, fresh: bool) -> dict[int, bool]:

@@ -31,9 +31,11 @@ Numbers = NDArray[np.int64]
 NOTICEABLE_M = 1e-5
 NOTICEABLE_RAD = 1e-6
 """A pose that moved by less is not news."""
-LARGE_NOTICEABLE_M = 1e-3
-LARGE_NOTICEABLE_RAD = 3e-4
-"""The same where the graph is condensed by regions: every loop moves much by very little."""
+ROUGHLY_NOTICEABLE = 1000.0
+"""Where the graph is condensed by regions, a loop moves much by little: only moves that are larger
+by this are news (a centimetre, a milliradian)."""
+EXACTLY_NOTICEABLE = 100.0
+"""The same after a settlement that took in everything."""
 TRIED_PER_STEP = 8
 """Loops that a step tries to take up; more than that wait for the solve of the whole graph."""
 
@@ -84,6 +86,8 @@ class OnlineGraph:
         self._hierarchy: Hierarchy | None = None
         self._condensed: dict[int, int] = {}
         """Of each loop that counts: its number in the hierarchy."""
+        self._was_exact = False
+        """Whether a settlement since the last news took in everything."""
         self._strained: set[int] = set()
         """Edges of the hierarchy that are known to be beyond their limit."""
         self._adjacency = Adjacency()
@@ -319,6 +323,7 @@ class OnlineGraph:
         numbers = range(len(odometry), len(edges))
         self._condensed = dict(zip(kept.tolist(), numbers, strict=True))
         settled = self._hierarchy.settle(self.poses, limit=self._limit)
+        self._was_exact = True
         self._strained = set(settled.strained.tolist())
         return set(settled.moved.tolist())
 
@@ -357,6 +362,7 @@ class OnlineGraph:
         """Bring all poses to the optimum; which moved, which edges are newly beyond the limit."""
         assert self._hierarchy is not None
         settled = self._hierarchy.settle(self.poses, limit=self._limit)
+        self._was_exact |= settled.exact
         return settled.moved, set(settled.strained.tolist()) - self._strained
 
     def _tried_by_all(self, number: int) -> set[int]:
@@ -377,16 +383,17 @@ class OnlineGraph:
 
     def _news(self, numbers: Numbers) -> Change:
         """Of some vertices, those that differ from what was told, which they are from now on."""
-        large = self._hierarchy is not None
-        least_m = LARGE_NOTICEABLE_M if large else NOTICEABLE_M
-        least_rad = LARGE_NOTICEABLE_RAD if large else NOTICEABLE_RAD
+        scale = 1.0
+        if self._hierarchy is not None:
+            scale = EXACTLY_NOTICEABLE if self._was_exact else ROUGHLY_NOTICEABLE
+        self._was_exact = False
         now, before = self.poses[numbers], self._told.view[numbers]
         new = np.isnan(before[:, 0, 0])
         before = np.where(new[:, None, None], now, before)
         step_m = np.linalg.norm(now[:, :3, 3] - before[:, :3, 3], axis=1)
         # The small-angle form is exact enough to tell whether there is news.
         turn_rad = np.linalg.norm(now[:, :3, :3] - before[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
-        news = new | (step_m > least_m) | (turn_rad > least_rad)
+        news = new | (step_m > scale * NOTICEABLE_M) | (turn_rad > scale * NOTICEABLE_RAD)
         news |= self.component[numbers] != self._told_component.view[numbers]
         flipped = self.kept != self._told_kept.view
         change = Change(

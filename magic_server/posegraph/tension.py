@@ -25,7 +25,6 @@ class Tension:
         """Residuals that matrices were last made at."""
         self._gradient = Rows((6,))
         self._fresh: dict[int, Array] = {}
-        """The part of the gradient that others than a step brought, and no step has answered."""
 
     def __len__(self) -> int:
         return len(self.edges)
@@ -46,7 +45,7 @@ class Tension:
         self._pulled(edge, np.array([number]), np.zeros((1, 2, 6)), fresh=True)
 
     def refresh(self, numbers: Numbers, poses: Array, *, fresh: bool) -> tuple[Array, Array]:
-        """Edges whose poses changed pull anew; `fresh` unless a step changed them.
+        """Edges whose poses changed pull anew; `fresh` counts the change as fresh.
 
         Returns their squared Mahalanobis norms (k,), and how far their residuals (m, rad) are from
         those that their matrices were made at (k,).
@@ -80,13 +79,18 @@ class Tension:
         """(n, 6)."""
         return self._gradient.view
 
-    def take_fresh(self) -> dict[int, Array]:
-        """The fresh part of the gradient (6,) by vertex; a step is going to answer it.
+    @property
+    def fresh(self) -> dict[int, Array]:
+        """The part of the gradient (6,) by vertex that came since it was last forgotten.
 
-        Each edge is in it with both ends, so that it adds up to no force and no moment.
+        Each edge is in it with both ends, so that it adds up to no force and no moment. A step that
+        answers it, and is refreshed as fresh too, leaves in it what the step missed.
         """
-        taken, self._fresh = self._fresh, {}
-        return taken
+        return self._fresh
+
+    def forget_fresh(self) -> None:
+        """What is left of it is small, or a step is going to answer the whole gradient."""
+        self._fresh = {}
 
     def _pulled(self, edges: EdgeArrays, numbers: Numbers, pull: Array, *, fresh: bool) -> None:
         change = pull - self._pull.view[numbers]

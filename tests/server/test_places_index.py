@@ -82,3 +82,18 @@ def test_refuses_bad_vectors_and_names():
         index.add("v0", np.ones(8))
     with pytest.raises(NotFound):
         index.remove("v99")
+
+
+def test_many_loaded_at_once_are_found_as_those_added_one_by_one():
+    vectors = unit_vectors(300)
+    names = [f"v{number}" for number in range(300)]
+    for limit in (1000, 100):
+        index = DescriptorIndex(32, exact_limit=limit)
+        index.load(names[:150], vectors[:150])
+        index.load(names[150:], vectors[150:])
+        assert len(index) == 300
+        assert index.is_exact == (limit == 1000)
+        assert index.query(vectors[7], 1)[0][0] == "v7"
+        with pytest.raises(AlreadyExists):
+            index.load(["new", "v3"], vectors[:2])
+        assert "new" not in index
