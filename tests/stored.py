@@ -24,6 +24,15 @@ def stored_files(config: ServerConfig) -> list[str]:
     return sorted(Path(key).name for key in kept)
 
 
+def stored_previews(config: ServerConfig) -> int:
+    """How many previews there are, of any session."""
+    place = bucket_of(config.store, config.data_dir)
+    if place is None:
+        return len(list(config.data_dir.glob("**/previews/*/*")))
+    keys = [key for key, _ in listed(BucketClient(place), "") if "/previews/" in key]
+    return len({key.rpartition("/")[0] for key in keys})
+
+
 def put_stray(blobs, sha256: str, data: bytes) -> None:
     """Leave a blob that nothing refers to."""
     if isinstance(blobs, BucketBlobs):

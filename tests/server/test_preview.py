@@ -18,6 +18,7 @@ from magic_server.server import Server
 from magic_server.store_config import StoreConfig
 from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import stored_previews
 
 PREVIEW = "sessions/room/maps/preview"
 
@@ -72,7 +73,7 @@ async def test_the_preview_is_there_before_any_merge_and_follows(
         _, ply = await client.download_global_map("sessions/room", format="ply")
         (tmp_path / "p.ply").write_bytes(ply)
         assert len(read_ply(tmp_path / "p.ply")) == len(cloud)
-        assert len(list((tmp_path / "previews").glob("*/*"))) == 1  # older ones are gone
+        await eventually(_only_one(server_config))  # older ones are gone
 
         # What is deleted is not shown any more, even before the next preview is made.
         await client.delete_submap(submaps[2].name, force=True)
@@ -82,6 +83,13 @@ async def test_the_preview_is_there_before_any_merge_and_follows(
         merged = await client.build_global_map("room", coarse_only=True)
         newest, _ = await client.download_global_map("sessions/room")
         assert newest.name == merged.name
+
+
+def _only_one(config: ServerConfig):
+    async def only_one() -> bool:
+        return await asyncio.to_thread(stored_previews, config) == 1
+
+    return only_one
 
 
 async def eventually(condition) -> None:
