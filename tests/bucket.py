@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from moto.server import ThreadedMotoServer
 
 from magic_server.store_config import StoreConfig
 
@@ -36,11 +35,13 @@ class BucketServer:
     def __init__(self) -> None:
         self.port = free_port()
         self.endpoint = f"http://127.0.0.1:{self.port}"
-        self._server: ThreadedMotoServer | None = None
+        self._server: Any = None
         self._files: Any = None
 
     def start(self) -> None:
         """Begin to serve; waits until it does."""
+        from moto.server import ThreadedMotoServer  # half a second of imports
+
         logging.getLogger("werkzeug").setLevel(logging.ERROR)
         self._server = ThreadedMotoServer("127.0.0.1", self.port, verbose=False)
         self._server.start()

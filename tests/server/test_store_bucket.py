@@ -25,7 +25,6 @@ from tests.server.test_store_durability import NO_DIGESTS, new_submap, registere
 from tests.small_world import make_submap
 from tests.swift import NoSwift, swift_server
 
-pytest.importorskip("s3fs")
 PART = 5 << 20
 
 
