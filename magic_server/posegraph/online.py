@@ -182,7 +182,8 @@ class OnlineGraph:
         if self._hierarchy is None and self._config.is_hierarchical(len(self)):
             touched |= self._condense()
         if self._hierarchy is not None:
-            touched |= self._settled_with(waiting)
+            # Without a loop, odometry has put the new where the optimum is.
+            touched |= self._settled_with(waiting) if waiting else set()
         else:
             for number in waiting[-TRIED_PER_STEP:]:
                 touched |= self._tried(number)
