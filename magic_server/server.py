@@ -25,6 +25,7 @@ from magicslam.v1 import session_service_pb2_grpc as session_grpc
 from magic_core import logs, tracing
 from magic_core.errors import Unavailable
 from magic_core.wire import server_options
+from magic_server import allocator
 from magic_server.access import AccessControl
 from magic_server.audit import AuditLog
 from magic_server.blob_watch import BlobWatch
@@ -347,9 +348,10 @@ async def serve(config: ServerConfig, *, on_ready: Callable[[Server], None] | No
     The first signal drains the server, a second one ends the process at once. SIGHUP reads the
     callers again; certificates are read again by themselves.
     """
+    allocator.keep_few_pools()
     server = Server(config)
     with _native_log(config, server), stop_signals(on_reload=server.access.reload) as stop:
-        async with server:
+        async with server, allocator.trimmed():
             _keep_the_loop_smooth()
             if on_ready is not None:
                 on_ready(server)

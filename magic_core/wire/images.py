@@ -65,11 +65,7 @@ def encode_depth_png(depth: NDArray[np.float32], *, metres_per_unit: float = 0.0
 
 def decode_colour(data: bytes, media_type: str, *, size: tuple[int, int]) -> NDArray[np.uint8]:
     """(h, w, 3) RGB of a JPEG or PNG that must have `size` = (width, height) pixels."""
-    header = read_header(data, media_type)
-    _require(header, size, bits=8, channels=(3,), what="colour image")
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = _decode(data, flags, media_type)
-    return np.ascontiguousarray(image[:, :, ::-1])
+    return np.ascontiguousarray(_colour_pixels(data, media_type, size)[:, :, ::-1])
 
 
 def decode_depth(
@@ -77,11 +73,7 @@ def decode_depth(
 ) -> NDArray[np.float32]:
     """(h, w) depth in metres of an image in planes, or a 16-bit grey PNG, of `size` = (width,
     height) pixels."""
-    _require(read_header(data, media_type), size, bits=16, channels=(1,), what="depth image")
-    if media_type == DEPTH_PLANES:
-        units = depth_planes.decode(data)
-    else:
-        units = _decode(data, cv2.IMREAD_UNCHANGED, media_type)
+    units = _depth_units(data, media_type, size)
     return units.astype(np.float32) * np.float32(metres_per_unit)
 
 
@@ -100,9 +92,25 @@ def read_header(data: bytes, media_type: str) -> ImageHeader:
 def check_image(data: bytes, media_type: str, *, size: tuple[int, int], depth: bool) -> None:
     """Raise unless the bytes decode to an image of the right kind and (width, height)."""
     if depth:
-        decode_depth(data, media_type, metres_per_unit=1.0, size=size)
+        _depth_units(data, media_type, size)
     else:
-        decode_colour(data, media_type, size=size)
+        _colour_pixels(data, media_type, size)
+
+
+def _colour_pixels(data: bytes, media_type: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """(h, w, 3) BGR."""
+    header = read_header(data, media_type)
+    _require(header, size, bits=8, channels=(3,), what="colour image")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    return _decode(data, flags, media_type)
+
+
+def _depth_units(data: bytes, media_type: str, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """(h, w) in units."""
+    _require(read_header(data, media_type), size, bits=16, channels=(1,), what="depth image")
+    if media_type == DEPTH_PLANES:
+        return depth_planes.decode(data)
+    return _decode(data, cv2.IMREAD_UNCHANGED, media_type)
 
 
 def _png_header(data: bytes) -> ImageHeader:
