@@ -94,7 +94,7 @@ def _only_one(config: ServerConfig):
 
 async def eventually(condition) -> None:
     """Return once an awaited condition holds."""
-    async with asyncio.timeout(60.0):
+    async with asyncio.timeout(600.0):  # a worker starts first
         while not await condition():  # noqa: ASYNC110  # the state is the server's
             await asyncio.sleep(0.05)
 
