@@ -236,27 +236,31 @@ def plot(files: list[Path], out: Path) -> None:
 
     rows = [json.loads(line) for file in files for line in file.read_text().splitlines()]
     rows = [row for row in rows if "limit" not in row]
-    figure, (times, memory) = pyplot.subplots(1, 2, figsize=(9, 3.6))
-    for part, key, label in (
-        ("descriptors", "query_ms", "descriptor query"),
-        ("graph", "placed_ms", "sub-map placed"),
-        ("graph", "accepted_loop_ms", "accepted loop"),
-    ):
-        own = sorted((row for row in rows if row["part"] == part), key=lambda row: row["size"])
+    figure, (times, memory) = pyplot.subplots(1, 2, figsize=(10, 3.8))
+    for part, kind in sorted({(row["part"], _kind(row)) for row in rows}):
+        own = [row for row in rows if (row["part"], _kind(row)) == (part, kind)]
+        own.sort(key=lambda row: row["size"])
         sizes = [row["size"] for row in own]
-        (line,) = times.loglog(sizes, [row[key]["p50"] for row in own], "o-", label=f"{label}, p50")
-        times.loglog(sizes, [row[key]["p99"] for row in own], ":", color=line.get_color(),
-                     label=f"{label}, p99")  # fmt: skip
-    for part, label in (("descriptors", "index"), ("graph", "pose graph")):
-        own = sorted((row for row in rows if row["part"] == part), key=lambda row: row["size"])
-        memory.loglog([row["size"] for row in own], [row["mib"] for row in own], "o-", label=label)
-    times.set(xlabel="sub-maps", ylabel="ms of processor")
+        shown = ("query_ms",) if part == "descriptors" else ("placed_ms", "accepted_loop_ms")
+        for key in shown:
+            label = f"{key.removesuffix('_ms').replace('_', ' ')}, {kind}"
+            (line,) = times.loglog(sizes, [row[key]["p50"] for row in own], "o-", label=label)
+            p99 = [row[key]["p99"] for row in own]
+            times.loglog(sizes, p99, "_", color=line.get_color(), markersize=12)
+        memory.loglog(sizes, [row["mib"] for row in own], "o-", label=f"{part}, {kind}")
+    times.set(xlabel="sub-maps", ylabel="ms of processor, p50 (dots) and p99 (bars)")
     memory.set(xlabel="sub-maps", ylabel="MiB")
     for axes in (times, memory):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(out, dpi=90)
+
+
+def _kind(row: dict) -> str:
+    if row["part"] == "descriptors":
+        return f"{row['dimension']} numbers"
+    return f"hierarchy {row['hierarchy']}"
 
 
 def main() -> None:
