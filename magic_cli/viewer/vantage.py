@@ -21,7 +21,8 @@ _BESIDE_PANEL = 0.7
 """The share of the page's width that the panel leaves free, at its left."""
 _MARGIN = 1.08
 _NEAREST_M = 1.0
-_EVERY_MEAN = 16
+_SAMPLES = 2000
+"""Gaussians of a sub-map that decide where to stand."""
 
 
 def up_of(view: SessionView, anchors: dict[str, Pose]) -> Vector:
@@ -57,7 +58,8 @@ def _points(view: SessionView, anchors: dict[str, Pose], up: Vector) -> Vector:
     parts = []
     for name, pose in anchors.items():
         submap = view.submaps[name]
-        some = np.asarray(submap.cloud.means[::_EVERY_MEAN], np.float64)
+        every = max(1, len(submap.cloud) // _SAMPLES)
+        some = np.asarray(submap.cloud.means[::every], np.float64)
         path = submap.path[:, :3, 3]
         hidden = above(some, path, pose[:3, :3].T @ up) if len(some) else np.zeros(0, bool)
         parts += [se3.transform_points(pose, p) for p in (some[~hidden], path)]

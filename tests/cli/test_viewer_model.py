@@ -12,6 +12,7 @@ import pytest
 from magic_cli.main import run_command
 from magic_cli.viewer.detail import covariances, keep_every, thinned
 from magic_cli.viewer.panel import trajectories_zip
+from magic_cli.viewer.vantage import FIELD_OF_VIEW_RAD, above, outside, up_of
 from magic_cli.viewer.words import agents_text, loop_text, loop_title, summary_text
 from magic_core.geometry import se3
 from magic_core.wire.records import AgentInfo, CorrectedPose, LoopCandidate
@@ -44,6 +45,32 @@ def test_tracked_poses_follow_the_odometry_from_the_first_sub_map():
     tracked = view.tracked()
     np.testing.assert_allclose(tracked[names[1]], old.world_from_anchor, atol=1e-9)
     assert not np.allclose(view.world_from_anchor()[names[1]], old.world_from_anchor, atol=0.1)
+
+
+@pytest.mark.parametrize("components", [((0,),), ((0, 1),), ((0,), (1,)), ((0,), (1,), (2,))])
+def test_the_whole_map_is_seen_beside_the_panel(components):
+    view = viewed_session(*components)
+    anchors = view.world_from_anchor()
+    up = up_of(view, anchors)
+    position, look_at = outside(view, anchors, up)
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    seen = []
+    for name, pose in anchors.items():
+        submap = view.submaps[name]
+        path, means = submap.path[:, :3, 3], submap.cloud.means
+        below = means[~above(means, path, pose[:3, :3].T @ up)]
+        seen += [se3.transform_points(pose, path), se3.transform_points(pose, below)]
+    axes = np.stack([right, np.cross(right, forward), forward])
+    x, y, z = axes @ (np.concatenate(seen) - position).T
+    assert z.min() > 0
+    upwards = y / z / np.tan(FIELD_OF_VIEW_RAD / 2)
+    across = x / z / np.tan(FIELD_OF_VIEW_RAD / 2) / 1.6  # of a wide page, the panel at its right
+    bottom, top = np.quantile(upwards, (0.02, 0.98))  # stray Gaussians may lie outside
+    left, right_end = np.quantile(across, (0.02, 0.98))
+    assert -1.05 < bottom < top < 1.05
+    assert -1.05 < left < right_end < 0.5
+    assert max((top - bottom) / 2, (right_end - left) / 1.4) > 0.7  # and it fills what is free
 
 
 def test_thinning_keeps_the_limit_and_covers_the_same_surface():

@@ -49,11 +49,18 @@ async def page_in_chromium(address: str) -> AsyncIterator:
 
 
 async def dismiss_notices(tab) -> None:
-    """Close what lies over the picture, such as the notice that no GPU renders."""
-    await tab.evaluate(
-        "document.querySelectorAll('.mantine-Notification-root button').forEach(b => b.click())"
-    )
-    await tab.wait_for_function("!document.querySelector('.mantine-Notification-root')")
+    """Close what lies over the picture, such as the notice that no GPU renders.
+
+    Another may come meanwhile, and one that goes by itself cannot be clicked: it is no failure.
+    """
+    for _ in range(60):
+        left = await tab.evaluate(
+            "(() => { const all = document.querySelectorAll('.mantine-Notification-root button');"
+            " all.forEach(button => button.click()); return all.length; })()"
+        )
+        if not left:
+            break
+        await tab.wait_for_timeout(500)
 
 
 async def says(tab, text: str) -> None:

@@ -35,9 +35,9 @@ def interrupted(flat, tmp_path_factory):
         "--submap.frames", "10", "--submap.min-frames", "5", "--merge.iterations", "20",
     )  # fmt: skip
     try:
-        wait_until(lambda: frames_seen(out) >= 12, timeout_s=400)
+        wait_until(lambda: frames_seen(out) >= 12, timeout_s=1200)
         process.send_signal(signal.SIGINT)
-        stdout, _ = process.communicate(timeout=400)
+        stdout, _ = process.communicate(timeout=1200)
     finally:
         children.stop_all()
     assert process.returncode == 0, children.log("run")
@@ -74,11 +74,11 @@ def test_it_can_be_measured_again(interrupted, capsys):
 
 def test_a_ctrl_c_before_anything_was_mapped_ends_with_130(flat, processes, tmp_path):
     process = processes.start("early", "run", str(flat), "--out", str(tmp_path / "out"))
-    wait_until(lambda: (tmp_path / "out" / "server" / "log.txt").is_file(), timeout_s=300)
+    wait_until(lambda: (tmp_path / "out" / "server" / "log.txt").is_file(), timeout_s=600)
     for _ in range(2):  # whatever the stage, the second one ends at once
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
-    process.communicate(timeout=120)
+    process.communicate(timeout=600)
     assert process.returncode == 130
     assert "Traceback" not in processes.log("early")
     assert "interrupted" in processes.log("early")

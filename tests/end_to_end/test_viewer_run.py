@@ -47,7 +47,7 @@ def running(tmp_path_factory):
     )  # fmt: skip
     address = re.compile(r"Open (http://\S+) in a browser")
     try:
-        wait_until(lambda: address.search(children.log("run")), timeout_s=300)
+        wait_until(lambda: address.search(children.log("run")), timeout_s=900)
         yield folder, process, address.search(children.log("run")).group(1), children
     finally:
         children.stop_all()
@@ -57,7 +57,7 @@ def running(tmp_path_factory):
 def finished(running):
     """The run folder after its end, and what `--json` printed."""
     folder, process, _, children = running
-    stdout, _ = process.communicate(timeout=500)
+    stdout, _ = process.communicate(timeout=1500)
     assert process.returncode == 0, children.log("run")
     return RunFolder(folder / "out"), json.loads(stdout.strip().splitlines()[-1])
 
