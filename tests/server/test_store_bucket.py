@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from magic_cli.bucket_check import bucket
 from magic_core.errors import ConfigError, CorruptData, NotFound, Unavailable, WrongState
 from magic_server.jobs.delivery import Deliveries
 from magic_server.store import BlobWriter, Store
@@ -279,6 +280,14 @@ async def test_what_is_wrong_is_said_at_the_start(
     wrong = dataclasses.replace(config, **settings)
     with ThreadPoolExecutor(1) as threads, pytest.raises(error, match=words):
         await Store(tmp_path, threads, config=wrong).open()
+
+
+def test_the_doctor_tries_a_bucket_and_leaves_nothing(config: StoreConfig) -> None:
+    assert bucket(config).status == "ok"
+    assert keys(config) == []
+    found = bucket(dataclasses.replace(config, blobs="s3://no-such-bucket"))
+    assert found.status == "fail"
+    assert "create the bucket no-such-bucket" in found.detail
 
 
 async def test_wrong_and_missing_credentials_are_named_and_never_shown(
