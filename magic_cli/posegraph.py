@@ -29,7 +29,7 @@ class SolveConfig:
     robust: Literal["none", "gnc"] = "gnc"
     """`gnc` finds and leaves out wrong loops; `none` trusts every edge."""
     hierarchy: Literal["auto", "on", "off"] = "auto"
-    """With `gnc`, find the optimum by regions: `auto` does so from 2000 vertices on."""
+    """With `gnc`, find the optimum by regions: `auto` does so from 10,000 vertices on."""
     out: Path | None = None
     """Write the solved graph here, as g2o."""
     json: bool = False

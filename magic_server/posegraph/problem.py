@@ -48,7 +48,7 @@ class PoseGraphConfig:
     hierarchy: Literal["auto", "on", "off"] = "auto"
     """Condense regions of the graph onto the separators between them, so that a new sub-map costs
     what its neighbourhood costs: `auto` does so from `hierarchy_from` sub-maps on."""
-    hierarchy_from: int = 2000
+    hierarchy_from: int = 10_000
     """How large a graph must be for `hierarchy` `auto`; smaller ones are solved as a whole."""
 
     def is_hierarchical(self, count: int) -> bool:

@@ -233,8 +233,8 @@ def test_a_file_is_solved_to_the_same_optimum_by_regions(tmp_path):
 
 
 def test_small_graphs_are_left_as_they_were():
-    assert not PoseGraphConfig().is_hierarchical(1999)
-    assert PoseGraphConfig().is_hierarchical(2000)
+    assert not PoseGraphConfig().is_hierarchical(9999)
+    assert PoseGraphConfig().is_hierarchical(10_000)
     assert not WHOLE.is_hierarchical(10**6)
     with pytest.raises(ConfigError, match=r"posegraph\.hierarchy"):
         PoseGraphConfig(hierarchy="maybe")  # type: ignore[arg-type]
