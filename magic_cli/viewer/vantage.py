@@ -47,10 +47,12 @@ def outside(view: SessionView, anchors: dict[str, Pose], up: Vector) -> tuple[Ve
     points = _points(view, anchors, up)
     ahead = _level(np.stack([pose[:3, 2] for pose in anchors.values()]).mean(axis=0), up)
     forward = np.cos(_ELEVATION_RAD) * ahead - np.sin(_ELEVATION_RAD) * up
-    right = np.cross(ahead, up)
-    axes = np.stack([right, np.cross(right, forward), forward])  # rows: right, upwards, forward
-    position, depth = _fitted(points @ axes.T)
-    return position @ axes, position @ axes + depth * forward
+    right = np.asarray(np.cross(ahead, up), np.float64)
+    upwards = np.asarray(np.cross(right, forward), np.float64)
+    axes = np.stack([right, upwards, forward])
+    place, depth = _fitted(points @ axes.T)
+    position: Vector = place @ axes
+    return position, position + depth * forward
 
 
 def _points(view: SessionView, anchors: dict[str, Pose], up: Vector) -> Vector:
