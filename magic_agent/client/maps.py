@@ -138,7 +138,10 @@ class MapCalls(Connection):
         request = map_pb.WaitOperationRequest(
             name=operation.name, timeout_s=wait_s, above_progress=operation.progress
         )
-        answer = await self.idempotent(self.map_stub.WaitOperation, request)
+        try:
+            answer = await self.idempotent(self.map_stub.WaitOperation, request)
+        except DeadlineExceeded:
+            return operation  # a busy server answers late: how long to wait is the caller's say
         return convert.operation_from_proto(answer.operation)
 
 

@@ -54,7 +54,7 @@ def test_late_early_and_killed_agents_leave_a_map_of_what_arrived(flat, processe
 async def final_state(target: str):
     """What the server holds once everybody is gone, and the map it makes of that."""
     async with MagicClient(target) as client:
-        info = await client.build_global_map("flat", timeout_s=200)
+        info = await client.build_global_map("flat", timeout_s=600)
         cloud = await client.get_global_map(info.name)
         listed = {agent.name.split("/")[-1]: agent for agent in await client.list_agents("flat")}
         submaps = await client.list_submaps("flat")

@@ -57,7 +57,7 @@ async def test_cpp_submits_submaps_and_reads_loops_and_poses(
         assert list(stored.blobs) == blobs_of(files)
     _, output, _ = await run(program, server.address, "submit", *files)
     assert json.loads(output)["duplicate"]
-    assert await (await server.sessions.named("room")).idle(timeout_s=100)
+    assert await (await server.sessions.named("room")).idle(timeout_s=600)
 
     _, output, _ = await run(program, server.address, "loops", name)
     (loop,) = json.loads(output)["candidates"]

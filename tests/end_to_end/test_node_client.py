@@ -78,7 +78,7 @@ async def test_node_reads_poses_loops_and_the_map(
         )
         await client.submit_submap(make_submap(agent=agent, camera=LARGE, submaps=3))
     coordinator = await server.sessions.named("room")
-    assert await coordinator.idle(timeout_s=100)
+    assert await coordinator.idle(timeout_s=600)
 
     expected = await client.get_corrected_poses("room")
     code, snapshot = await ask(server, "poses", "room")

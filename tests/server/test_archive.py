@@ -66,13 +66,13 @@ async def source(
                 await client.submit_submap(make_submap(agent=agent, index=index, submaps=SUBMAPS))
         await client.finish_agent("room", "agent_0")
         coordinator = await server.sessions.named("room")
-        assert await coordinator.idle(timeout_s=60)
+        assert await coordinator.idle(timeout_s=600)
         loop = records.LoopCandidate(name_of(3), name_of(0), 0.9, "PENDING", "PENDING")
         await server._store.loops.add_candidates(coordinator.session, name_of(3), [loop])
         settled = dataclasses.replace(loop, verdict="REJECTED", reason="LOW_FITNESS", fitness=0.25)
         await server._store.loops.settle(coordinator.session, settled)
         await client.delete_submap(name_of(1))
-        assert await coordinator.idle(timeout_s=60)
+        assert await coordinator.idle(timeout_s=600)
         await client.build_global_map("room", coarse_only=True)
         yield client
 
@@ -130,7 +130,7 @@ async def test_a_session_comes_back_whole_in_another_server(
     async with MagicClient(target.address, ClientConfig(rpc_timeout_s=60.0)) as client:
         info = await client.import_session(pieces(archive))
         assert info == await source.get_session("room")
-        assert await (await target.sessions.named("room")).idle(timeout_s=60)
+        assert await (await target.sessions.named("room")).idle(timeout_s=600)
         await assert_same(source, client)
         again = b"".join([piece async for piece in client.export_session("room")])
         assert names_in(again) == names_in(archive)

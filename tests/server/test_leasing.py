@@ -136,7 +136,7 @@ async def test_sessions_of_a_silent_server_move_and_it_cannot_write(
         stored = [info.name for info in await client.list_submaps("room")]
         assert stored == [one.header.name for one in encoded]
         coordinator = await b.sessions.named("room")
-        assert await coordinator.idle(60)
+        assert await coordinator.idle(600)
         assert len((await client.get_corrected_poses("room")).poses) == 2
 
 
@@ -172,7 +172,7 @@ async def test_a_merge_goes_on_where_its_session_goes(servers: list[Server]) -> 
         await register(client)
         await client.submit_submap(make_submap())
         session = await a._store.agents.session("room")
-        assert await (await a.sessions.named("room")).idle(60)
+        assert await (await a.sessions.named("room")).idle(600)
         await client.finish_agent("room", "agent_0")
         await client.start_global_map("room", coarse_only=True)
         await fall_silent(a)

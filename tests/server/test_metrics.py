@@ -84,7 +84,7 @@ async def test_calls_submaps_loops_jobs_and_refusals_are_counted(watched: Server
         with pytest.raises(InvalidInput):
             await client.get_session("..")
         coordinator = await watched.sessions.named("room")
-        assert await coordinator.idle(100)
+        assert await coordinator.idle(600)
     found = await scraped(watched)
     assert found["magic_submaps_total"] == 2
     assert found["magic_submap_bytes_total"] == sum(sizes)

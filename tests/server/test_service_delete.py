@@ -83,7 +83,7 @@ async def fill(
 
 async def settled(server: Server, client: MagicClient):
     """The newest solution once there is nothing left to do."""
-    assert await (await server.sessions.named("room")).idle(timeout_s=60)
+    assert await (await server.sessions.named("room")).idle(timeout_s=600)
     return await client.get_corrected_poses("room")
 
 

@@ -62,7 +62,7 @@ async def mapped(
         Server(config) as second,
         MagicClient(second.address, ClientConfig(localize_timeout_s=240.0)) as client,
     ):
-        assert await (await second.sessions.named("room")).idle(timeout_s=60)
+        assert await (await second.sessions.named("room")).idle(timeout_s=600)
         yield second, client
 
 

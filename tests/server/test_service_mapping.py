@@ -77,7 +77,7 @@ async def mapped(config: ServerConfig) -> AsyncIterator[tuple[Server, MagicClien
         for index in range(SUBMAPS):
             await asyncio.gather(*(client.submit_submap(submap_of(a, index)) for a in range(2)))
         coordinator = await server.sessions.named("room")
-        assert await coordinator.idle(timeout_s=100)
+        assert await coordinator.idle(timeout_s=600)
         yield server, client, seen
         watcher.cancel()
 
@@ -265,6 +265,25 @@ async def test_a_global_map_is_built_with_progress_and_read_in_every_format(
     assert len(await client.list_operations("room")) == 1
 
 
+async def test_waiting_for_a_map_outlasts_answers_that_come_too_late(mapped) -> None:
+    server, client, _ = mapped
+    status = await client.start_global_map("room", coarse_only=True, request_id="first map")
+    running = dataclasses.replace(status, state="RUNNING", progress=0.25)
+    late = 0
+
+    async with MagicClient(server.address, ClientConfig(rpc_timeout_s=60.0)) as patient:
+        in_time = patient.map_stub.WaitOperation
+
+        async def too_late_twice(request, *, timeout: float):  # noqa: ASYNC109 (as gRPC has it)
+            nonlocal late
+            late += 1
+            return await in_time(request, timeout=-1.0 if late < 3 else timeout)
+
+        patient.map_stub.WaitOperation = too_late_twice
+        assert await patient.wait_operation(running, timeout_s=600) == status
+    assert late == 3
+
+
 async def test_a_component_that_is_not_there_fails_the_operation(mapped) -> None:
     _, client, _ = mapped
     with pytest.raises(NotFound, match="no component"):
@@ -280,7 +299,7 @@ async def test_a_server_started_again_knows_everything(mapped, config: ServerCon
         await first.stop()
     async with Server(dataclasses.replace(config, listen=listen)) as second:
         coordinator = await second.sessions.named("room")
-        assert await coordinator.idle(timeout_s=60)
+        assert await coordinator.idle(timeout_s=600)
         after = await client.get_corrected_poses("room")
         assert (after.revision, after.components) == (before.revision, before.components)
         for name, pose in before.poses.items():
@@ -300,7 +319,7 @@ async def test_a_server_started_again_knows_everything(mapped, config: ServerCon
         await client.submit_submap(late)
         (part,) = await client.get_trajectory("room", "agent_2", wait_s=60.0)
         assert (part.submap, len(part.frames)) == (late.name, len(late.trajectory))
-        assert await coordinator.idle(timeout_s=100)
+        assert await coordinator.idle(timeout_s=600)
         final = await client.get_corrected_poses("room")
         assert final.revision > before.revision
         assert len(final.components) == 1
