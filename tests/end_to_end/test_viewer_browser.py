@@ -69,7 +69,7 @@ async def shown(tmp_path_factory) -> AsyncIterator[tuple[Page, Feed, MagicClient
             for agent in range(2):
                 await client.submit_submap(make_submap(agent=agent, index=index, camera=LARGE))
         await client.submit_submap(turned_away())
-        assert await (await server.sessions.named("room")).idle(timeout_s=240)
+        assert await (await server.sessions.named("room")).idle(timeout_s=600)
         page = Page(host="127.0.0.1", port=8080, max_splats=20_000)
         feed = Feed(client, session="room", draw=page.update, interval_s=0.2)
         for _ in range(3):
