@@ -7,6 +7,7 @@ import os
 import sys
 from typing import Any
 
+from magic_cli import lifeline
 from magic_core.errors import ConfigError, MagicError
 
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -45,6 +46,7 @@ EXIT_OK, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point. Exits 0 ok, 1 failed, 2 usage, 130 interrupted."""
+    lifeline.hold()
     sys.exit(run_command(sys.argv[1:] if arguments is None else arguments))
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from magic_cli import lifeline
 from magic_core.errors import Unavailable
 
 Progress = Callable[[str, dict], None]
@@ -59,13 +60,13 @@ def environment(threads: int) -> dict[str, str]:
 
 
 async def start(name: str, arguments: list[str], *, log: Path, threads: int) -> Child:
-    """Start `magic ARGUMENTS` as a child; its stderr goes to a log file."""
+    """Start `magic ARGUMENTS` as a child that ends with us; its stderr goes to a log file."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as stream:
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "magic_cli", *arguments,
-            stdin=asyncio.subprocess.DEVNULL, stdout=PIPE, stderr=stream,
-            env=environment(threads), limit=STREAM_LIMIT_BYTES,
+            stdin=PIPE, stdout=PIPE, stderr=stream,
+            env=lifeline.tied(environment(threads)), limit=STREAM_LIMIT_BYTES,
             # A Ctrl-C on the terminal reaches the driver alone, which then asks its children.
             start_new_session=True,
         )  # fmt: skip

@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from magic_cli import processes
+from magic_cli import lifeline, processes
 from magic_cli.options import parse
 from magic_cli.output import console
 from magic_cli.systemd import notify
@@ -94,6 +94,7 @@ def _start_viewer(target: str, command: ServeCommand) -> subprocess.Popen:
     """The live view of this server, at low priority: watching never slows the run."""
     page = ["--port", str(command.viewer_port), "--max-splats", str(command.viewer_splats)]
     arguments = [sys.executable, "-m", "magic_cli", "view", target, *page]
-    viewer = subprocess.Popen(arguments, stdin=subprocess.DEVNULL)
+    tied = lifeline.tied(dict(os.environ))
+    viewer = subprocess.Popen(arguments, stdin=subprocess.PIPE, env=tied)
     processes.give_way(viewer.pid)
     return viewer
