@@ -178,7 +178,7 @@ def _session(config: ViewerBenchmark) -> SessionView:
 def _submap(
     name: str, agent: str, index: int, count: int, frames: int, rng: np.random.Generator
 ) -> SubmapView:
-    from magic_cli.viewer.model import SubmapView
+    from magic_cli.viewer.model import SubmapView, extent_of
     from magic_core.gaussians import GaussianCloud
     from magic_core.geometry import Camera, se3
     from magic_core.submap import Keyframe
@@ -199,6 +199,6 @@ def _submap(
     keyframe = Keyframe(0, 0.0, se3.identity(), colour, depth)
     previous = (index - 1, se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 2.0]))
     times = tuple(0.1 * k for k in range(frames))
-    return SubmapView(
-        name, agent, index, camera, cloud, path, times, (keyframe,), previous if index else None
-    )
+    previous = previous if index else None
+    extent = extent_of(cloud, path)
+    return SubmapView(name, agent, index, camera, cloud, path, times, (keyframe,), previous, extent)

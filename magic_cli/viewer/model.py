@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,21 +33,25 @@ class SubmapView:
     keyframes: tuple[Keyframe, ...]
     previous: tuple[int, Pose] | None
     """Index of the sub-map before, and previous_from_anchor as it was tracked."""
+    extent: NDArray[np.float64]  # (k, 3) anchor frame
+    """How far it reaches; see `extent_of`."""
 
     @classmethod
     def of(cls, submap: Submap) -> SubmapView:
         """From a sub-map as downloaded."""
         edge = submap.odometry
+        path = np.stack([frame.anchor_from_camera for frame in submap.trajectory])
         return cls(
             name=submap.name,
             agent=submap.agent,
             index=submap.index,
             camera=submap.camera,
             cloud=submap.gaussians,
-            path=np.stack([frame.anchor_from_camera for frame in submap.trajectory]),
+            path=path,
             times_s=tuple(frame.timestamp_s for frame in submap.trajectory),
             keyframes=submap.keyframes,
             previous=(edge.previous_index, edge.previous_from_anchor) if edge else None,
+            extent=extent_of(submap.gaussians, path),
         )
 
 
@@ -124,23 +129,36 @@ class SessionView:
         offsets: dict[str, Pose] = {}
         edge = 0.0
         for component in self.snapshot.components:
-            positions = [
-                (pose.world_from_anchor @ self.submaps[name].path)[:, 0, 3]
+            reached = [
+                se3.transform_points(pose.world_from_anchor, self.submaps[name].extent)[:, 0]
                 for name, pose in self.snapshot.poses.items()
                 if pose.component == component.id and name in self.submaps
             ]
             low, high = 0.0, 0.0
-            if positions:
-                low = float(min(p.min() for p in positions))
-                high = float(max(p.max() for p in positions))
+            if reached:
+                low = float(min(x.min() for x in reached))
+                high = float(max(x.max() for x in reached))
             shift = 0.0 if not offsets else edge - low + _GAP_M
             offsets[component.id] = se3.from_rotation_translation(np.eye(3), [shift, 0.0, 0.0])
             edge = shift + high
         return offsets
 
 
-_GAP_M = 4.0
-"""Between the paths of two components, metres: a room's width, so that maps rarely overlap."""
+_GAP_M = 1.0
+"""Between the maps of two components, metres."""
+_STRAY_SHARE = 0.05
+"""Of a sub-map's Gaussians at either end of an axis that its extent leaves out."""
+
+
+def extent_of(cloud: GaussianCloud, path: Pose) -> NDArray[np.float64]:
+    """(k, 3) points that a sub-map reaches in its anchor's frame: its cameras, and the corners of
+    the box around all but the outermost Gaussians."""
+    cameras = path[:, :3, 3]
+    if len(cloud) == 0:
+        return cameras
+    ends = np.quantile(cloud.means, (_STRAY_SHARE, 1.0 - _STRAY_SHARE), axis=0)
+    corners = np.array(list(itertools.product(*ends.T.astype(np.float64))))
+    return np.concatenate([cameras, corners])
 
 
 def _sibling(name: str, index: int) -> str:

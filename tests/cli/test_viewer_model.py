@@ -29,9 +29,18 @@ def test_one_component_stands_in_its_own_world_frame():
 def test_components_stand_side_by_side():
     view = viewed_session((0,), (1,))
     anchors = view.world_from_anchor()
-    first = [p[0, 3] for n, p in anchors.items() if "agent_0" in n]
-    second = [p[0, 3] for n, p in anchors.items() if "agent_1" in n]
-    assert min(second) - max(first) > 3.5
+    first, second = (
+        np.concatenate(
+            [
+                se3.transform_points(pose, view.submaps[name].cloud.means)[:, 0]
+                for name, pose in anchors.items()
+                if agent in name
+            ]
+        )
+        for agent in ("agent_0", "agent_1")
+    )
+    # The maps, not only the paths, which are short in a large room; strays may reach further.
+    assert np.quantile(second, 0.05) - np.quantile(first, 0.95) > 0.9
 
 
 def test_tracked_poses_follow_the_odometry_from_the_first_sub_map():

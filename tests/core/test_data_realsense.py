@@ -114,6 +114,7 @@ def test_the_same_recording_is_read_as_a_bag_with_its_extrinsics(recording):
     assert ((aligned > 0) != (source[0].depth > 0)).mean() < 0.05
 
 
+@pytest.mark.slow  # librealsense looks for one for 15 s
 def test_no_camera_is_a_clear_error():
     pytest.importorskip("pyrealsense2", reason="needs the realsense extra")
     with pytest.raises(DataError, match="plugged into USB 3"):

@@ -309,7 +309,7 @@ def test_without_dask_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.Mo
         (["10.0.0.5:8786"], "expected tcp://HOST:PORT"),
         (["tls://h:8786"], "needs tls.ca, .certificate and .key"),
         (["tcp://h:8786", "--resources", "gpu"], "expected NAME=AMOUNT"),
-        (["tcp://h:8786", "--data-dir", "nowhere"], "mount the server's data folder first"),
+        (["tcp://h:8786", "--data-dir", "nowhere"], "mount or make it first"),
         (["tcp://h:8786", "--processes", "0"], "processes and threads are at least 1"),
     ],
 )

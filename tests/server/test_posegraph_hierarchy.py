@@ -198,6 +198,7 @@ def test_agents_that_meet_and_a_wrong_loop_end_as_in_one_solve_of_all(regional_g
     assert apart_m(regional.poses, whole.poses) < 0.01
 
 
+@pytest.mark.slow
 def test_growing_by_regions_gives_the_same_every_time(regional_graph):
     first, second = regional_graph, online(REGIONAL)
     np.testing.assert_array_equal(first.kept, second.kept)
