@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
-from scipy.linalg.blas import dtrsm
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from magic_server.posegraph import stacked
 from magic_server.posegraph.dissection import Dissection
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+_potrf, _trtrs = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
+(_trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
 
 DAMPING = 1e-6
 """Added to each diagonal: a vertex that no edge holds in some direction stays where it is."""
@@ -147,7 +148,7 @@ class Fronts:
             flat = rhs.ravel()
             result[node] = solved = flat[:own]
             if own:
-                result[node], _ = lapack.dtrtrs(front.factor, solved, lower=1)
+                result[node], _ = _trtrs(front.factor, solved, lower=1)
                 flat[own:] -= front.coupling.T @ result[node]
             if len(front.above):
                 above = flat[own:].reshape(-1, 6)
@@ -174,7 +175,7 @@ class Fronts:
                 flat = np.zeros(6 * len(front.own)) if rhs is None else rhs
                 if len(above):
                     flat = flat - front.coupling @ above.ravel()
-                own, _ = lapack.dtrtrs(front.factor, flat, lower=1, trans=1)
+                own, _ = _trtrs(front.factor, flat, lower=1, trans=1)
                 moves.update(zip(front.own.tolist(), own.reshape(-1, 6), strict=True))
             stack.extend(self._tree.nodes[node].children)
         vertices = np.array(sorted(moves), dtype=np.int64)
@@ -238,12 +239,12 @@ def _is_like(front: Front, before: Front) -> bool:
 def _front(own: Numbers, above: Numbers, matrix: Array, split: int) -> Front:
     if not split:
         return Front(own, above, np.zeros((0, 0)), np.zeros((0, len(matrix))), matrix)
-    factor, info = lapack.dpotrf(matrix[:split, :split], lower=1, clean=1)
+    factor, info = _potrf(matrix[:split, :split], lower=1, clean=1)
     if info:
         raise np.linalg.LinAlgError(f"vertex {own[max(info - 1, 0) // 6]} is not held by its edges")
     if not len(above):
         return Front(own, above, factor, np.zeros((split, 0)), np.zeros((0, 0)))
-    coupling = dtrsm(1.0, factor, matrix[:split, split:], lower=1)
+    coupling = _trsm(1.0, factor, matrix[:split, split:], lower=1)
     condensed = matrix[split:, split:] - coupling.T @ coupling
     return Front(own, above, factor, coupling, condensed)
 
