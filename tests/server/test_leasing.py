@@ -57,6 +57,13 @@ def target_of(servers: list[Server]) -> str:
     return ",".join(server.address for server in servers)
 
 
+def in_turn(servers: list[Server]) -> tuple[Server, Server]:
+    """The server that has the session, and the other one: a client of both goes to whichever
+    answers first."""
+    first, second = servers
+    return (first, second) if first.sessions.found("room") else (second, first)
+
+
 async def register(client: MagicClient, session: str = "room", agent: str = "agent_0"):
     return await client.register_agent(session, agent, model_id=MODEL_ID, dimension=DIMENSION)
 
@@ -120,10 +127,10 @@ async def test_a_client_that_knows_one_server_follows_the_session(servers: list[
 async def test_sessions_of_a_silent_server_move_and_it_cannot_write(
     servers: list[Server],
 ) -> None:
-    a, b = servers
     encoded = [encode_submap(make_submap(index=i), request_id=f"r{i}") for i in range(2)]
     async with MagicClient(target_of(servers), CLIENT) as client:
         await register(client)
+        a, b = in_turn(servers)
         await client.submit_encoded(encoded[0])
         session = (await a.sessions.named("room")).session
         await fall_silent(a)
@@ -141,23 +148,23 @@ async def test_sessions_of_a_silent_server_move_and_it_cannot_write(
 
 
 async def test_a_lease_that_another_server_took_ends_the_work_here(servers: list[Server]) -> None:
-    a, b = servers
     async with MagicClient(target_of(servers), CLIENT) as client:
         await register(client)
+        holder, other = in_turn(servers)
         watching = asyncio.create_task(anext(client.watch_corrected_poses("room")))
-        await eventually(lambda: a.gate.watches == 1)
-        await take_over(b)
-        await eventually(lambda: a.sessions.found("room") is None)
+        await eventually(lambda: holder.gate.watches == 1)
+        await take_over(other)
+        await eventually(lambda: holder.sessions.found("room") is None)
         # The watcher was sent on, and sees what happens there.
         await client.submit_submap(make_submap())
         assert len((await asyncio.wait_for(watching, 60)).poses) == 1
-        assert b.gate.watches == 1
+        assert other.gate.watches == 1
 
 
 async def test_a_server_that_stops_hands_its_sessions_over_at_once(servers: list[Server]) -> None:
-    a, b = servers
     async with MagicClient(target_of(servers), CLIENT) as client:
         await register(client)
+        a, b = in_turn(servers)
         await client.submit_submap(make_submap())
         await a.stop()
         await eventually(lambda: b.sessions.found("room") is not None)
@@ -167,9 +174,9 @@ async def test_a_server_that_stops_hands_its_sessions_over_at_once(servers: list
 
 @pytest.mark.slow
 async def test_a_merge_goes_on_where_its_session_goes(servers: list[Server]) -> None:
-    a, b = servers
     async with MagicClient(target_of(servers), CLIENT) as client:
         await register(client)
+        a, b = in_turn(servers)
         await client.submit_submap(make_submap())
         session = await a._store.agents.session("room")
         assert await (await a.sessions.named("room")).idle(600)
