@@ -15,6 +15,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from magic_core import zstd_frame
 from magic_core.errors import CorruptData, InvalidInput, ResourceExhausted
 from magic_core.gaussians.cloud import GaussianCloud
 from magic_core.gaussians.morton import BITS, morton_codes
@@ -207,18 +208,7 @@ def _pack(layout: int, count: int, payload: bytes, level: int) -> bytes:
 
 def _unpack(data: bytes, size: int) -> bytes:
     """The zstd frame's content, which must be exactly `size` bytes."""
-    frame = data[_HEADER.size :]
-    try:
-        if zstandard.frame_content_size(frame) != size:
-            raise CorruptData(f"Gaussian payload does not hold the {size} bytes its count needs")
-        content = zstandard.ZstdDecompressor().decompress(
-            frame, max_output_size=size, allow_extra_data=False
-        )
-    except zstandard.ZstdError as error:
-        raise CorruptData(f"Gaussian payload is not a zstd frame: {error}") from error
-    if len(content) != size:
-        raise CorruptData(f"Gaussian payload is {len(content)} bytes, its count needs {size}")
-    return content
+    return zstd_frame.content_of(data[_HEADER.size :], size, what="Gaussian payload")
 
 
 def _decode_lossless(payload: bytes, count: int) -> GaussianCloud:

@@ -13,6 +13,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from magic_core import zstd_frame
 from magic_core.errors import CorruptData, InvalidInput
 
 MEDIA_TYPE = "application/vnd.magicslam.depth"
@@ -54,7 +55,8 @@ def decode(data: bytes) -> NDArray[np.uint16]:
     Raises CorruptData when the bytes are not in the format, InvalidInput for another version.
     """
     levels, width, height = _read_header(data)
-    content = _content(data[_HEADER.size :], 2 * (levels + width * height))
+    size = 2 * (levels + width * height)
+    content = zstd_frame.content_of(data[_HEADER.size :], size, what="the depth image")
     table = np.frombuffer(content, "<u2", levels).astype(np.uint16)
     planes = np.frombuffer(content, np.uint8, offset=2 * levels).reshape(2, height, width)
     codes = planes[0] | (planes[1].astype(np.uint16) << 8)
@@ -79,17 +81,3 @@ def _read_header(data: bytes) -> tuple[int, int, int]:
     if reserved or levels > MAX_LEVELS or not width or not height:
         raise CorruptData("the depth image's header holds values that have no meaning")
     return levels, width, height
-
-
-def _content(frame: bytes, size: int) -> bytes:
-    try:
-        if zstandard.frame_content_size(frame) != size:
-            raise CorruptData(f"the depth image does not hold the {size} bytes its size needs")
-        content = zstandard.ZstdDecompressor().decompress(
-            frame, max_output_size=size, allow_extra_data=False
-        )
-    except zstandard.ZstdError as error:
-        raise CorruptData(f"the depth image is not a zstd frame: {error}") from error
-    if len(content) != size:
-        raise CorruptData(f"the depth image is {len(content)} bytes, its size needs {size}")
-    return content
