@@ -27,6 +27,14 @@ class Metrics:
         ProcessCollector(registry=registry)
         PlatformCollector(registry=registry)
         GCCollector(registry=registry)
+        self._queues = Gauge(
+            "magic_queue_depth", "What waits in a queue, by queue.", ("queue",), registry=registry
+        )
+        self._count_calls(registry)
+        self._count_work(registry)
+        self._count_blobs(registry)
+
+    def _count_calls(self, registry: CollectorRegistry) -> None:
         self.rpc_seconds = Histogram(
             "magic_rpc_seconds",
             "Time of a call from its first byte to its end, by method and gRPC code.",
@@ -49,6 +57,11 @@ class Metrics:
         self.received_bytes = Counter(
             "magic_received_bytes", "Bytes of blob chunks that arrived.", registry=registry
         )
+        self.audit_failures = Counter(
+            "magic_audit_failures", "Audit lines that could not be written.", registry=registry
+        )
+
+    def _count_work(self, registry: CollectorRegistry) -> None:
         self.submaps = Counter("magic_submaps", "Sub-maps that became durable.", registry=registry)
         self.submap_bytes = Counter(
             "magic_submap_bytes",
@@ -81,9 +94,8 @@ class Metrics:
             buckets=_JOB_BUCKETS_S,
             registry=registry,
         )
-        self.audit_failures = Counter(
-            "magic_audit_failures", "Audit lines that could not be written.", registry=registry
-        )
+
+    def _count_blobs(self, registry: CollectorRegistry) -> None:
         self.blob_requests = Counter(
             "magic_blob_requests",
             "Requests to the bucket, by operation and outcome: ok, missing or failed.",
@@ -96,9 +108,6 @@ class Metrics:
             ("operation",),
             buckets=_BLOB_BUCKETS_S,
             registry=registry,
-        )
-        self._queues = Gauge(
-            "magic_queue_depth", "What waits in a queue, by queue.", ("queue",), registry=registry
         )
 
     def job_done(self, job: str, outcome: str, waited_s: float, ran_s: float) -> None:

@@ -19,7 +19,9 @@ import resource
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,9 @@ from scipy.spatial import KDTree
 
 from magic_server.posegraph import Edge, PoseGraphConfig, stacked
 from magic_server.posegraph.simulated import INFORMATION, SIGMAS
+
+if TYPE_CHECKING:
+    from magic_server.posegraph.online import NewVertex
 
 AGENTS = 100
 Array = NDArray[np.float64]
@@ -131,35 +136,56 @@ def partners(poses: Array, generator: np.random.Generator) -> NDArray[np.int64]:
     return found
 
 
-def measure_graph(size: int, *, added: int, hierarchy: str) -> dict:
-    """A graph of `size` sub-maps as after a restart; then `added` arrive, each with a loop."""
-    from magic_server.posegraph.online import NewVertex, OnlineGraph
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """Sub-maps of agents that wander through one hall, as they would be submitted."""
 
-    generator = np.random.default_rng(0)
-    truth = hall(size + added, generator)
-    partner = partners(truth, generator)
-    count = len(truth)
+    truth: Array  # (n, 4, 4) world_from_anchor
+    names: list[str]
+    """Resource names, in order of arrival."""
+    tracked: Array  # (n - AGENTS, 4, 4) from each agent's sub-map before, as measured
+    loops: dict[int, Edge]
+    """By the number of the newer sub-map."""
 
-    def measured(source: NDArray, target: NDArray) -> Array:
-        noise = stacked.exp(generator.normal(size=(len(source), 6)) * SIGMAS)
-        return stacked.inverse(truth[source]) @ truth[target] @ noise
+    @classmethod
+    def of(cls, count: int) -> Simulated:
+        """The same ones every time."""
+        generator = np.random.default_rng(0)
+        truth = hall(count, generator)
+        partner = partners(truth, generator)
 
-    names = [f"sessions/s/agents/a{n % AGENTS}/submaps/{n // AGENTS}" for n in range(count)]
-    later = np.arange(AGENTS, count)
-    tracked = measured(later - AGENTS, later)
-    looped = np.flatnonzero(partner >= 0)
-    matched = measured(partner[looped], looped)
+        def measured(source: NDArray, target: NDArray) -> Array:
+            noise = stacked.exp(generator.normal(size=(len(source), 6)) * SIGMAS)
+            return stacked.inverse(truth[source]) @ truth[target] @ noise
 
-    def vertex(n: int) -> NewVertex:
+        names = [f"sessions/s/agents/a{n % AGENTS}/submaps/{n // AGENTS}" for n in range(count)]
+        later = np.arange(AGENTS, count)
+        tracked = measured(later - AGENTS, later)
+        looped = np.flatnonzero(partner >= 0)
+        matched = measured(partner[looped], looped)
+        loops = {
+            n: Edge(names[partner[n]], names[n], matched[row], INFORMATION)
+            for row, n in enumerate(looped.tolist())
+        }
+        return cls(truth, names, tracked, loops)
+
+    def vertex(self, n: int) -> NewVertex:
+        """A sub-map with its odometry edge."""
+        from magic_server.posegraph.online import NewVertex
+
         edge = None
         if n >= AGENTS:
-            edge = Edge(names[n - AGENTS], names[n], tracked[n - AGENTS], INFORMATION)
-        return NewVertex(names[n], edge, group=f"a{n % AGENTS}")
+            before = self.names[n - AGENTS]
+            edge = Edge(before, self.names[n], self.tracked[n - AGENTS], INFORMATION)
+        return NewVertex(self.names[n], edge, group=f"a{n % AGENTS}")
 
-    edges = {
-        n: Edge(names[partner[n]], names[n], matched[row], INFORMATION)
-        for row, n in enumerate(looped.tolist())
-    }
+
+def measure_graph(size: int, *, added: int, hierarchy: str) -> dict:
+    """A graph of `size` sub-maps as after a restart; then `added` arrive, each with a loop."""
+    from magic_server.posegraph.online import OnlineGraph
+
+    simulated = Simulated.of(size + added)
+    names, edges, vertex = simulated.names, simulated.loops, simulated.vertex
     old = [n for n in edges if n < size]
     simulated_mib = rss_mib()
     config = PoseGraphConfig(
@@ -170,7 +196,7 @@ def measure_graph(size: int, *, added: int, hierarchy: str) -> dict:
     started = time.process_time()
     graph.restore(
         [vertex(n) for n in range(size)], [edges[n] for n in old],
-        poses={names[n]: (names[0], truth[n]) for n in range(size)},
+        poses={names[n]: (names[0], simulated.truth[n]) for n in range(size)},
         kept=range(len(old)), settled=True,
     )  # fmt: skip
     restore_s = time.process_time() - started
@@ -178,7 +204,7 @@ def measure_graph(size: int, *, added: int, hierarchy: str) -> dict:
     graph.advance([], [])
     begin_s = time.process_time() - started
     placed, accepted, told = [], [], []
-    for n in range(size, count):
+    for n in range(size, size + added):
         started = time.process_time()
         graph.advance([vertex(n)], [])
         placed.append(time.process_time() - started)

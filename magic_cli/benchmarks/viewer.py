@@ -197,8 +197,8 @@ def _submap(
     colour = rng.integers(0, 255, (camera.height, camera.width, 3), dtype=np.uint8)
     depth = np.ones((camera.height, camera.width), np.float32)
     keyframe = Keyframe(0, 0.0, se3.identity(), colour, depth)
-    previous = (index - 1, se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 2.0]))
+    step = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 2.0])
+    previous = (index - 1, step) if index else None
     times = tuple(0.1 * k for k in range(frames))
-    previous = previous if index else None
     extent = extent_of(cloud, path)
     return SubmapView(name, agent, index, camera, cloud, path, times, (keyframe,), previous, extent)
