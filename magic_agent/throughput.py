@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -138,9 +138,10 @@ def confined(threads: int) -> Iterator[int | None]:
 
 
 def _set_cores(cores: set[int]) -> None:
-    """For every thread of this process: libraries have started some already."""
+    """For every thread of this process: libraries have started some already, and some end meanwhile."""
     for task in Path("/proc/self/task").iterdir():
-        os.sched_setaffinity(int(task.name), cores)
+        with suppress(ProcessLookupError):
+            os.sched_setaffinity(int(task.name), cores)
 
 
 def measure(source: FrameSource, config: AgentConfig, model: DescriptorModel) -> AgentSpeed:
