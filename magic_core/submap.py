@@ -24,6 +24,9 @@ class Keyframe:
     anchor_from_camera: NDArray[np.float64]  # (4, 4)
     colour: NDArray[np.uint8]  # (h, w, 3) RGB
     depth: NDArray[np.float32]  # (h, w) metres, 0 = no reading
+    descriptor: NDArray[np.float32] | None = None
+    """(d,) unit L2 norm, by the model of the sub-map's own; None for keyframe 0, which has that
+    one, and for those by which the place is not to be found."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,14 +100,19 @@ def make_submap(
     keyframes: int = 2,
     submaps: int = 4,
     known_start: bool = False,
+    described: bool = False,
 ) -> Submap:
-    """A sub-map of an agent that walks through the room, with its exact poses."""
+    """A sub-map of an agent that walks through the room, with its exact poses.
+
+    `described`: its keyframes have descriptors too.
+    """
     anchors = path(agent, submaps)
     world_from_anchor = anchors[index]
     step = se3.exp([0.02, 0.0, 0.01, 0.0, 0.01, 0.0])
     poses = [np.linalg.matrix_power(step, i) for i in range(frames)]
     kept = np.unique(np.linspace(0, frames - 1, keyframes).astype(int)).tolist()
     images = {i: render(camera, world_from_anchor @ poses[i]) for i in kept}
+    vectors = {i: thumbnail(images[i][0]).vector for i in kept[1:] if described}
     start = index * frames
     time_of = {i: 0.1 * (start + i) for i in range(frames)}
     odometry = None
@@ -120,7 +125,9 @@ def make_submap(
         index=index,
         camera=camera,
         gaussians=gaussians_of(camera, *images[0]),
-        keyframes=tuple(Keyframe(start + i, time_of[i], poses[i], *images[i]) for i in kept),
+        keyframes=tuple(
+            Keyframe(start + i, time_of[i], poses[i], *images[i], vectors.get(i)) for i in kept
+        ),
         trajectory=tuple(
             TrackedFrame(start + i, time_of[i], poses[i], lost=i == 2) for i in range(frames)
         ),

@@ -85,6 +85,8 @@ def loop_to_proto(loop: records.LoopCandidate) -> mapping_pb.LoopCandidate:
         overlap=loop.overlap,
         verify_seconds=loop.verify_seconds,
         kept=loop.kept,
+        source_keyframe=loop.source_keyframe,
+        target_keyframe=loop.target_keyframe,
     )
     if loop.target_from_source is not None:
         message.target_from_source.CopyFrom(geometry.pose_to_proto(loop.target_from_source))
@@ -113,6 +115,8 @@ def loop_from_proto(message: mapping_pb.LoopCandidate) -> records.LoopCandidate:
         overlap=message.overlap,
         verify_seconds=message.verify_seconds,
         kept=message.kept,
+        source_keyframe=message.source_keyframe,
+        target_keyframe=message.target_keyframe,
     )
 
 

@@ -153,13 +153,23 @@ def descriptor_from_proto(message: geometry_pb2.Descriptor) -> Descriptor:
     return Descriptor(message.model_id, np.array(message.vector, dtype=np.float32))
 
 
+def vector_from_proto(values: Sequence[float]) -> NDArray[np.float32] | None:
+    """The descriptor (d,) of a keyframe, whose header was checked; None where it has none."""
+    return np.array(values, dtype=np.float32) if values else None
+
+
 def descriptor_problem(message: geometry_pb2.Descriptor, *, max_dimension: int) -> str | None:
     """What is wrong with a descriptor, or None."""
     if not 1 <= len(message.model_id) <= 128 or not message.model_id.isprintable():
         return "model_id must be 1 to 128 printable characters"
     if not 1 <= len(message.vector) <= max_dimension:
         return f"{len(message.vector)} numbers, expected 1 to {max_dimension}"
-    vector = np.array(message.vector, dtype=np.float64)
+    return unit_problem(message.vector)
+
+
+def unit_problem(values: Sequence[float]) -> str | None:
+    """What keeps numbers from being a unit vector, or None."""
+    vector = np.array(values, dtype=np.float64)
     if not np.isfinite(vector).all():
         return "holds NaN or infinity; send finite numbers only"
     norm = float(np.linalg.norm(vector))

@@ -37,6 +37,8 @@ class SubmapLimits:
     """Gaussians in it."""
     max_descriptor_dimension: int = 8192
     """Length of its descriptor."""
+    max_described_keyframes: int = 32
+    """Keyframes with a descriptor of their own; each is one more vector in the index."""
 
 
 def check_header(header: submap_pb2.SubmapHeader, limits: SubmapLimits = SubmapLimits()) -> None:
@@ -45,6 +47,7 @@ def check_header(header: submap_pb2.SubmapHeader, limits: SubmapLimits = SubmapL
     Slow for thousands of frames: call it off the event loop.
     """
     _check_limits(header, limits)
+    _check_described(header, limits)
     found: list[FieldViolation] = []
     for violation in _violations(header, limits):
         found.append(violation)
@@ -77,6 +80,15 @@ def _check_limits(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> None
             )
 
 
+def _check_described(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> None:
+    described = sum(bool(keyframe.image_descriptor) for keyframe in header.keyframes)
+    if described > (limit := limits.max_described_keyframes):
+        raise ResourceExhausted(
+            f"{described} keyframes of the sub-map have descriptors, this server takes {limit}; "
+            "describe fewer"
+        )
+
+
 def _violations(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> Iterator[FieldViolation]:
     yield from _identity_violations(header)
     if (pixels := header.camera.width * header.camera.height) > limits.max_pixels:
@@ -89,6 +101,7 @@ def _violations(header: submap_pb2.SubmapHeader, limits: SubmapLimits) -> Iterat
     dimension = limits.max_descriptor_dimension
     if problem := geometry.descriptor_problem(header.image_descriptor, max_dimension=dimension):
         yield FieldViolation("image_descriptor", problem)
+    yield from _keyframe_descriptor_violations(header)
     if header.HasField("world_from_anchor_prior"):
         row = geometry.pose_row(header.world_from_anchor_prior)
         if problem := geometry.pose_problems(row[None])[0]:
@@ -157,6 +170,19 @@ def _keyframe_violations(header: submap_pb2.SubmapHeader) -> Iterator[FieldViola
                 yield FieldViolation(f"keyframes[{i}].{field}", problem)
     if frames and keyframes[0].frame_index != header.trajectory[0].frame_index:
         yield FieldViolation("keyframes[0].frame_index", "must be the trajectory's first frame")
+
+
+def _keyframe_descriptor_violations(header: submap_pb2.SubmapHeader) -> Iterator[FieldViolation]:
+    length = len(header.image_descriptor.vector)
+    for i, keyframe in enumerate(header.keyframes):
+        values = keyframe.image_descriptor
+        problem = geometry.unit_problem(values) if values else None
+        if values and i == 0:
+            problem = "the descriptor of keyframe 0 is the sub-map's `image_descriptor`"
+        elif values and len(values) != length:
+            problem = f"{len(values)} numbers, expected the {length} of `image_descriptor`"
+        if problem:
+            yield FieldViolation(f"keyframes[{i}].image_descriptor", problem)
 
 
 def _blob_violations(header: submap_pb2.SubmapHeader) -> Iterator[FieldViolation]:

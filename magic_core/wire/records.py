@@ -78,6 +78,10 @@ class LoopCandidate:
     verify_seconds: float = 0.0
     kept: bool = False
     """True when the newest solution of the pose graph relies on it."""
+    source_keyframe: int = 0
+    """Which of the source's keyframes looks like the target; 0 is the anchor."""
+    target_keyframe: int = 0
+    """Which of the target's keyframes looks like the source; 0 is the anchor."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from magicslam.v1 import submap_pb2
+from numpy.typing import NDArray
 
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud, codec
@@ -79,6 +80,7 @@ def encode_submap(
             anchor_from_camera=geometry.pose_to_proto(keyframe.anchor_from_camera),
             colour_blob=blobs.add(colour, submap_pb2.BLOB_ROLE_COLOUR, media_type),
             depth_blob=blobs.add(depth, submap_pb2.BLOB_ROLE_DEPTH, images.DEPTH_PLANES, unit),
+            image_descriptor=() if keyframe.descriptor is None else keyframe.descriptor.tolist(),
         )
     header.blobs.extend(blobs.infos)
     return EncodedSubmap(header, tuple(blobs.data))
@@ -194,7 +196,16 @@ def _keyframe_from_proto(
             metres_per_unit=depth_info.metres_per_unit,
             size=size,
         ),
+        descriptor=geometry.vector_from_proto(message.image_descriptor),
     )
+
+
+def decode_keyframe_descriptors(
+    header: submap_pb2.SubmapHeader,
+) -> tuple[tuple[int, NDArray[np.float32]], ...]:
+    """(place among the keyframes, unit vector (d,)) of those of a checked header that have one."""
+    vectors = [geometry.vector_from_proto(item.image_descriptor) for item in header.keyframes]
+    return tuple((place, vector) for place, vector in enumerate(vectors) if vector is not None)
 
 
 def _frame_to_proto(frame: TrackedFrame) -> submap_pb2.TrackedFrame:

@@ -20,6 +20,7 @@ from magic_core.wire import (
     images,
 )
 from magic_core.wire.chunks import sha256
+from magic_core.wire.submap import decode_keyframe_descriptors
 from tests.small_world import DIMENSION, make_submap
 
 
@@ -77,6 +78,26 @@ def test_a_known_start_travels_with_the_submap() -> None:
     )
 
 
+def test_descriptors_of_keyframes_travel_bit_by_bit_and_cost_nothing_without() -> None:
+    submap = make_submap(index=1, keyframes=3, described=True)
+    encoded = encode_submap(submap, request_id="r")
+    check_header(encoded.header)
+    decoded = decode_submap(encoded.header, encoded.blobs)
+    assert decoded.anchor.descriptor is None
+    for before, after in zip(submap.keyframes[1:], decoded.keyframes[1:], strict=True):
+        assert before.descriptor is not None
+        assert after.descriptor is not None
+        np.testing.assert_array_equal(before.descriptor, after.descriptor)
+    places = [place for place, _ in decode_keyframe_descriptors(encoded.header)]
+    assert places == [1, 2]
+    bare = encode_submap(make_submap(index=1, keyframes=3), request_id="r")
+    # Packed: four bytes per number, and a tag with two lengths.
+    assert 0 < encoded.header.ByteSize() - bare.header.ByteSize() - 2 * 4 * DIMENSION < 16
+    for keyframe in encoded.header.keyframes:
+        keyframe.ClearField("image_descriptor")
+    assert encoded.header.SerializeToString(True) == bare.header.SerializeToString(True)
+
+
 def test_depth_beyond_the_range_becomes_no_reading() -> None:
     submap = make_submap()
     depth = submap.anchor.depth.copy()
@@ -128,6 +149,12 @@ def _unnormalise(header: submap_pb2.SubmapHeader) -> None:
     header.keyframes[1].anchor_from_camera.qw = 2.0
 
 
+def _describe_keyframe(header: submap_pb2.SubmapHeader, place: int, values: list[float]) -> None:
+    header.keyframes[place].image_descriptor[:] = values
+
+
+UNIT = [1.0] + [0.0] * (DIMENSION - 1)
+
 BROKEN = {
     "name": lambda h: setattr(h, "name", "sessions/../agents/a/submaps/1"),
     "request_id": lambda h: setattr(h, "request_id", ""),
@@ -145,6 +172,8 @@ BROKEN = {
     "keyframes[1].frame_index": lambda h: setattr(h.keyframes[1], "frame_index", 99),
     "keyframes[1].colour_blob": lambda h: setattr(h.keyframes[1], "colour_blob", 77),
     "keyframes[1].depth_blob": lambda h: setattr(h.keyframes[1], "depth_blob", 0),
+    "keyframes[0].image_descriptor": lambda h: _describe_keyframe(h, 0, UNIT),
+    "keyframes[1].image_descriptor": lambda h: _describe_keyframe(h, 1, UNIT[:-1]),
     "image_descriptor": lambda h: h.image_descriptor.vector.append(0.5),
     "odometry.previous_index": lambda h: setattr(h.odometry, "previous_index", 1),
     "odometry.previous_from_anchor": lambda h: h.odometry.ClearField("previous_from_anchor"),
@@ -164,6 +193,37 @@ def test_each_broken_rule_is_named(field: str) -> None:
     header = header_of()
     BROKEN[field](header)
     assert field in {violation.field for violation in violations(header)}
+
+
+@pytest.mark.parametrize(
+    ("values", "rule"),
+    [
+        ([*UNIT, 0.0], "expected the 144"),
+        ([1.0], "expected the 144"),
+        ([0.0] * DIMENSION, "norm 0"),
+        ([float("nan"), *UNIT[1:]], "NaN or infinity"),
+        ([float("inf"), *UNIT[1:]], "NaN or infinity"),
+        ([3.4e38] * DIMENSION, "norm"),
+        ([1.01, *UNIT[1:]], "norm 1.01"),
+    ],
+)
+def test_a_keyframe_is_not_described_by_anything_but_a_unit_vector_of_the_length(
+    values: list[float], rule: str
+) -> None:
+    header = header_of()
+    _describe_keyframe(header, 1, UNIT)
+    check_header(header)
+    _describe_keyframe(header, 1, values)
+    found = violations(header)[0]
+    assert found.field == "keyframes[1].image_descriptor"
+    assert rule in found.description
+
+
+def test_more_described_keyframes_than_the_server_takes_are_refused() -> None:
+    header = encode_submap(make_submap(keyframes=4, described=True), request_id="r").header
+    check_header(header, SubmapLimits(max_described_keyframes=3))
+    with pytest.raises(ResourceExhausted, match=r"3 keyframes .* takes 2; describe fewer"):
+        check_header(header, SubmapLimits(max_described_keyframes=2))
 
 
 def test_an_indefinite_information_matrix_is_refused() -> None:

@@ -339,6 +339,8 @@ class LoopCandidate(_message.Message):
     OVERLAP_FIELD_NUMBER: _builtins.int
     VERIFY_SECONDS_FIELD_NUMBER: _builtins.int
     KEPT_FIELD_NUMBER: _builtins.int
+    SOURCE_KEYFRAME_FIELD_NUMBER: _builtins.int
+    TARGET_KEYFRAME_FIELD_NUMBER: _builtins.int
     source: _builtins.str
     """Resource name of the sub-map that asked; empty for a raw descriptor."""
     target: _builtins.str
@@ -362,6 +364,14 @@ class LoopCandidate(_message.Message):
     kept: _builtins.bool
     """True when the newest solution of the pose graph relies on it; false for an accepted loop that the
     robust solver set aside.
+    """
+    source_keyframe: _builtins.int
+    """Which keyframe of the source looks like the target, by its place in the header's `keyframes`;
+    0: the anchor.
+    """
+    target_keyframe: _builtins.int
+    """Which keyframe of the target looks like the source, by its place in the header's `keyframes`;
+    0: the anchor.
     """
     @_builtins.property
     def target_from_source(self) -> _geometry_pb2.Pose:
@@ -391,10 +401,12 @@ class LoopCandidate(_message.Message):
         overlap: _builtins.float = ...,
         verify_seconds: _builtins.float = ...,
         kept: _builtins.bool = ...,
+        source_keyframe: _builtins.int = ...,
+        target_keyframe: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["target_from_source", b"target_from_source"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["fitness", b"fitness", "information", b"information", "inliers", b"inliers", "kept", b"kept", "overlap", b"overlap", "reason", b"reason", "rmse_m", b"rmse_m", "similarity", b"similarity", "source", b"source", "target", b"target", "target_from_source", b"target_from_source", "verdict", b"verdict", "verify_seconds", b"verify_seconds"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["fitness", b"fitness", "information", b"information", "inliers", b"inliers", "kept", b"kept", "overlap", b"overlap", "reason", b"reason", "rmse_m", b"rmse_m", "similarity", b"similarity", "source", b"source", "source_keyframe", b"source_keyframe", "target", b"target", "target_from_source", b"target_from_source", "target_keyframe", b"target_keyframe", "verdict", b"verdict", "verify_seconds", b"verify_seconds"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -25,25 +25,25 @@ _sym_db = _symbol_database.Default()
 from magicslam.v1 import geometry_pb2 as magicslam_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19magicslam/v1/submap.proto\x12\x0cmagicslam.v1\x1a\x1bmagicslam/v1/geometry.proto\"}\n\x08\x42lobInfo\x12$\n\x04role\x18\x01 \x01(\x0e\x32\x16.magicslam.v1.BlobRole\x12\x12\n\nmedia_type\x18\x02 \x01(\t\x12\x0e\n\x06length\x18\x03 \x01(\x04\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\x12\x17\n\x0fmetres_per_unit\x18\x05 \x01(\x01\"v\n\x0cTrackedFrame\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12.\n\x12\x61nchor_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0c\n\x04lost\x18\x04 \x01(\x08\"\x8d\x01\n\x08Keyframe\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12.\n\x12\x61nchor_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0b\x63olour_blob\x18\x04 \x01(\r\x12\x12\n\ndepth_blob\x18\x05 \x01(\r\"m\n\x0cOdometryEdge\x12\x16\n\x0eprevious_index\x18\x01 \x01(\r\x12\x30\n\x14previous_from_anchor\x18\x02 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0binformation\x18\x03 \x03(\x01\"\x87\x03\n\x0cSubmapHeader\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12$\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x14.magicslam.v1.Camera\x12.\n\ntrajectory\x18\x04 \x03(\x0b\x32\x1a.magicslam.v1.TrackedFrame\x12)\n\tkeyframes\x18\x05 \x03(\x0b\x32\x16.magicslam.v1.Keyframe\x12\x32\n\x10image_descriptor\x18\x06 \x01(\x0b\x32\x18.magicslam.v1.Descriptor\x12,\n\x08odometry\x18\x07 \x01(\x0b\x32\x1a.magicslam.v1.OdometryEdge\x12\x33\n\x17world_from_anchor_prior\x18\x08 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12%\n\x05\x62lobs\x18\t \x03(\x0b\x32\x16.magicslam.v1.BlobInfo\x12\x16\n\x0egaussians_blob\x18\n \x01(\r\"L\n\tBlobChunk\x12\x12\n\nblob_index\x18\x01 \x01(\r\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12\r\n\x05\x63rc32\x18\x04 \x01(\x07*i\n\x08\x42lobRole\x12\x19\n\x15\x42LOB_ROLE_UNSPECIFIED\x10\x00\x12\x17\n\x13\x42LOB_ROLE_GAUSSIANS\x10\x01\x12\x14\n\x10\x42LOB_ROLE_COLOUR\x10\x02\x12\x13\n\x0f\x42LOB_ROLE_DEPTH\x10\x03\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19magicslam/v1/submap.proto\x12\x0cmagicslam.v1\x1a\x1bmagicslam/v1/geometry.proto\"}\n\x08\x42lobInfo\x12$\n\x04role\x18\x01 \x01(\x0e\x32\x16.magicslam.v1.BlobRole\x12\x12\n\nmedia_type\x18\x02 \x01(\t\x12\x0e\n\x06length\x18\x03 \x01(\x04\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\x12\x17\n\x0fmetres_per_unit\x18\x05 \x01(\x01\"v\n\x0cTrackedFrame\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12.\n\x12\x61nchor_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x0c\n\x04lost\x18\x04 \x01(\x08\"\xa7\x01\n\x08Keyframe\x12\x13\n\x0b\x66rame_index\x18\x01 \x01(\r\x12\x13\n\x0btimestamp_s\x18\x02 \x01(\x01\x12.\n\x12\x61nchor_from_camera\x18\x03 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0b\x63olour_blob\x18\x04 \x01(\r\x12\x12\n\ndepth_blob\x18\x05 \x01(\r\x12\x18\n\x10image_descriptor\x18\x06 \x03(\x02\"m\n\x0cOdometryEdge\x12\x16\n\x0eprevious_index\x18\x01 \x01(\r\x12\x30\n\x14previous_from_anchor\x18\x02 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12\x13\n\x0binformation\x18\x03 \x03(\x01\"\x87\x03\n\x0cSubmapHeader\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\nrequest_id\x18\x02 \x01(\t\x12$\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x14.magicslam.v1.Camera\x12.\n\ntrajectory\x18\x04 \x03(\x0b\x32\x1a.magicslam.v1.TrackedFrame\x12)\n\tkeyframes\x18\x05 \x03(\x0b\x32\x16.magicslam.v1.Keyframe\x12\x32\n\x10image_descriptor\x18\x06 \x01(\x0b\x32\x18.magicslam.v1.Descriptor\x12,\n\x08odometry\x18\x07 \x01(\x0b\x32\x1a.magicslam.v1.OdometryEdge\x12\x33\n\x17world_from_anchor_prior\x18\x08 \x01(\x0b\x32\x12.magicslam.v1.Pose\x12%\n\x05\x62lobs\x18\t \x03(\x0b\x32\x16.magicslam.v1.BlobInfo\x12\x16\n\x0egaussians_blob\x18\n \x01(\r\"L\n\tBlobChunk\x12\x12\n\nblob_index\x18\x01 \x01(\r\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x12\r\n\x05\x63rc32\x18\x04 \x01(\x07*i\n\x08\x42lobRole\x12\x19\n\x15\x42LOB_ROLE_UNSPECIFIED\x10\x00\x12\x17\n\x13\x42LOB_ROLE_GAUSSIANS\x10\x01\x12\x14\n\x10\x42LOB_ROLE_COLOUR\x10\x02\x12\x13\n\x0f\x42LOB_ROLE_DEPTH\x10\x03\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'magicslam.v1.submap_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_BLOBROLE']._serialized_start=1046
-  _globals['_BLOBROLE']._serialized_end=1151
+  _globals['_BLOBROLE']._serialized_start=1072
+  _globals['_BLOBROLE']._serialized_end=1177
   _globals['_BLOBINFO']._serialized_start=72
   _globals['_BLOBINFO']._serialized_end=197
   _globals['_TRACKEDFRAME']._serialized_start=199
   _globals['_TRACKEDFRAME']._serialized_end=317
   _globals['_KEYFRAME']._serialized_start=320
-  _globals['_KEYFRAME']._serialized_end=461
-  _globals['_ODOMETRYEDGE']._serialized_start=463
-  _globals['_ODOMETRYEDGE']._serialized_end=572
-  _globals['_SUBMAPHEADER']._serialized_start=575
-  _globals['_SUBMAPHEADER']._serialized_end=966
-  _globals['_BLOBCHUNK']._serialized_start=968
-  _globals['_BLOBCHUNK']._serialized_end=1044
+  _globals['_KEYFRAME']._serialized_end=487
+  _globals['_ODOMETRYEDGE']._serialized_start=489
+  _globals['_ODOMETRYEDGE']._serialized_end=598
+  _globals['_SUBMAPHEADER']._serialized_start=601
+  _globals['_SUBMAPHEADER']._serialized_end=992
+  _globals['_BLOBCHUNK']._serialized_start=994
+  _globals['_BLOBCHUNK']._serialized_end=1070
 # @@protoc_insertion_point(module_scope)

@@ -140,6 +140,7 @@ class Keyframe(_message.Message):
     ANCHOR_FROM_CAMERA_FIELD_NUMBER: _builtins.int
     COLOUR_BLOB_FIELD_NUMBER: _builtins.int
     DEPTH_BLOB_FIELD_NUMBER: _builtins.int
+    IMAGE_DESCRIPTOR_FIELD_NUMBER: _builtins.int
     frame_index: _builtins.int
     """The frame's number; one of the trajectory's."""
     timestamp_s: _builtins.float
@@ -152,6 +153,13 @@ class Keyframe(_message.Message):
     def anchor_from_camera(self) -> _geometry_pb2.Pose:
         """Maps points of this frame's camera to the anchor, metres; the identity for keyframe 0."""
 
+    @_builtins.property
+    def image_descriptor(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Descriptor of this image by the model of `image_descriptor` and of the same length, unit L2 norm
+        within 1e-3: the place is then found by this view too. Empty for none, and for keyframe 0, whose
+        descriptor is `image_descriptor`.
+        """
+
     def __init__(
         self,
         *,
@@ -160,10 +168,11 @@ class Keyframe(_message.Message):
         anchor_from_camera: _geometry_pb2.Pose | None = ...,
         colour_blob: _builtins.int = ...,
         depth_blob: _builtins.int = ...,
+        image_descriptor: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera", "colour_blob", b"colour_blob", "depth_blob", b"depth_blob", "frame_index", b"frame_index", "timestamp_s", b"timestamp_s"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["anchor_from_camera", b"anchor_from_camera", "colour_blob", b"colour_blob", "depth_blob", b"depth_blob", "frame_index", b"frame_index", "image_descriptor", b"image_descriptor", "timestamp_s", b"timestamp_s"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
