@@ -21,6 +21,7 @@ from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.delivery import Deliveries, Delivery, JobFile
 from magic_server.jobs.tasks import MergeOutcome, MergeTask, PlacedFiles, merge_submaps
+from magic_server.seams import seams_of
 from magic_server.sessions import Sessions
 from magic_server.store import MapFile, NewMap, SessionRow, Store, WrittenBlob
 from magic_server.store.blobs import translated_disk_errors
@@ -185,12 +186,13 @@ class GlobalMaps:
         request: map_pb.BuildGlobalMapRequest,
         delivery: Delivery,
     ) -> MergeTask:
+        seams = await self._in_thread(seams_of, chosen, coordinator.graph.odometry_of)
         placed = []
         for pose in chosen:
             _, agent, index = names.parse_submap(pose.submap)
             stored = await self._store.submaps.stored(coordinator.session, agent, index)
             transform = geometry.pose_from_proto(pose.world_from_anchor)
-            placed.append(PlacedFiles(pose.submap, stored, transform))
+            placed.append(PlacedFiles(pose.submap, stored, transform, seams[pose.submap]))
         config = self._config.merge
         if request.coarse_only:
             config = dataclasses.replace(config, refine=False, fill=False)

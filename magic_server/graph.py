@@ -12,6 +12,7 @@ import numpy as np
 from magicslam.v1 import geometry_pb2
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
+from magic_core.submap import OdometryEdge
 from magic_core.wire import convert, names, records
 from magic_server.bridging import bridged
 from magic_server.posegraph import Edge, PoseGraphConfig, stacked
@@ -70,6 +71,11 @@ class SessionGraph:
         """Timestamps of a sub-map's first and last frame; None for one that is gone."""
         vertex = self._vertices.get(submap)
         return vertex and vertex.span_s
+
+    def odometry_of(self, submap: str) -> OdometryEdge | None:
+        """A sub-map's tracked motion; None for the first of a chain and for one that is gone."""
+        vertex = self._vertices.get(submap)
+        return vertex and vertex.odometry
 
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""

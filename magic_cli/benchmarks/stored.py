@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magicslam.v1 import submap_pb2
+
 from magic_core.errors import DataError
 from magic_core.evaluation import RunFolder
 from magic_core.wire import names
@@ -29,18 +31,30 @@ def stored_sources(folder: RunFolder) -> list[StoredSource]:
 
 
 async def _sources(folder: RunFolder) -> list[StoredSource]:
+    from magic_core.wire.submap import decode_odometry
     from magic_server.jobs.tasks import PlacedFiles, StoredSource
+    from magic_server.seams import seams_of_anchors
     from magic_server.store import Store
 
     components = folder.read_components()
     main = components.largest()
-    found = []
+    anchors = {
+        name: anchor.world_from_anchor
+        for name, anchor in components.anchors.items()
+        if anchor.component == main
+    }
+    stored = {}
     with ThreadPoolExecutor(2) as threads:
         async with Store(folder.server_folder, threads) as store:
-            for name, anchor in components.anchors.items():
-                if anchor.component == main:
-                    session, agent, index = names.parse_submap(name)
-                    row = await store.agents.session(session)
-                    stored = await store.submaps.stored(row, agent, index)
-                    found.append(PlacedFiles(name, stored, anchor.world_from_anchor))
-    return [StoredSource.of(item) for item in found]
+            for name in anchors:
+                session, agent, index = names.parse_submap(name)
+                row = await store.agents.session(session)
+                stored[name] = await store.submaps.stored(row, agent, index)
+    headers = {
+        name: submap_pb2.SubmapHeader.FromString(item.header) for name, item in stored.items()
+    }
+    seams = seams_of_anchors(anchors, lambda name: decode_odometry(headers[name]))
+    return [
+        StoredSource.of(PlacedFiles(name, stored[name], anchors[name], seams[name]))
+        for name in anchors
+    ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import Camera, se3
+from magic_core.geometry.seams import Seams, seams_between
 from magic_core.submap import Keyframe, Submap
 from magic_core.wire import names
 from magic_core.wire.records import AgentInfo, LoopCandidate, PoseSnapshot
@@ -30,6 +31,7 @@ class SubmapView:
     path: NDArray[np.float64]  # (n, 4, 4) anchor_from_camera of its frames
     times_s: tuple[float, ...]
     """Their timestamps."""
+    frame_indices: tuple[int, ...]
     keyframes: tuple[Keyframe, ...]
     previous: tuple[int, Pose] | None
     """Index of the sub-map before, and previous_from_anchor as it was tracked."""
@@ -49,10 +51,15 @@ class SubmapView:
             cloud=submap.gaussians,
             path=path,
             times_s=tuple(frame.timestamp_s for frame in submap.trajectory),
+            frame_indices=tuple(frame.frame_index for frame in submap.trajectory),
             keyframes=submap.keyframes,
             previous=(edge.previous_index, edge.previous_from_anchor) if edge else None,
             extent=extent_of(submap.gaussians, path),
         )
+
+    def spread(self, seams: Seams) -> NDArray[np.float64]:
+        """(n, 4, 4) anchor_from_camera of its frames, with what its seams ask of them."""
+        return seams.spread(self.path, np.arange(len(self.path)) / len(self.path))
 
 
 @dataclass(slots=True)
@@ -104,11 +111,37 @@ class SessionView:
 
     def world_from_cameras(self, agent: str, anchors: dict[str, Pose]) -> list[NDArray[np.float64]]:
         """(n, 4, 4) poses of the frames of each sub-map of an agent, in order."""
-        return [
-            anchors[view.name] @ view.path
-            for view in self.submaps.values()
-            if view.agent == agent and view.name in anchors
-        ]
+        mine = [v for v in self.submaps.values() if v.agent == agent and v.name in anchors]
+        seams = self._seams(mine, anchors)
+        return [anchors[view.name] @ view.spread(seams[view.name]) for view in mine]
+
+    def world_from_keyframe(self, submap: str, keyframe: int) -> Pose:
+        """The corrected pose (4, 4) of a keyframe in its component's own world frame.
+
+        The merged map was made with its seams spread; sub-maps that lie as they were sent are seen
+        best from where each was tracked.
+        """
+        assert self.snapshot is not None
+        view, pose = self.submaps[submap], self.snapshot.poses[submap]
+        if pose.component not in self.merged:
+            return pose.world_from_anchor @ view.keyframes[keyframe].anchor_from_camera
+        anchors = {
+            name: pose.world_from_anchor
+            for name, pose in self.snapshot.poses.items()
+            if name in self.submaps and self.submaps[name].agent == view.agent
+        }
+        seams = self._seams([self.submaps[name] for name in anchors], anchors)[submap]
+        frames = anchors[submap] @ view.spread(seams)
+        return frames[view.frame_indices.index(view.keyframes[keyframe].frame_index)]
+
+    def _seams(self, views: list[SubmapView], anchors: dict[str, Pose]) -> dict[str, Seams]:
+        """How sub-maps, of one agent, meet each other."""
+        odometry = {
+            view.name: (_sibling(view.name, view.previous[0]), view.previous[1])
+            for view in views
+            if view.previous is not None
+        }
+        return seams_between({view.name: anchors[view.name] for view in views}, odometry)
 
     def camera_positions(self, component: str) -> NDArray[np.float64]:
         """(k, 3) where the cameras of a component's frames stood, in its own world frame."""

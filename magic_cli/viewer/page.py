@@ -126,12 +126,12 @@ class Page:
         with self._lock:
             assert self._view is not None
             assert self._view.snapshot is not None
-            submap, pose = self._view.submaps[name], self._view.snapshot.poses[name]
-            parts = _parts_of(self._view, pose.component)
+            camera = self._view.submaps[name].camera
+            parts = _parts_of(self._view, self._view.snapshot.poses[name].component)
+            at = self._view.world_from_keyframe(name, keyframe)
         with self._render_lock:  # a large map takes a second: the page is kept up to date meanwhile
             self._rasteriser = self._rasteriser or Rasteriser()
-            at = pose.world_from_anchor @ submap.keyframes[keyframe].anchor_from_camera
-            view = self._rasteriser.render(_joined(parts), submap.camera, at)
+            view = self._rasteriser.render(_joined(parts), camera, at)
         return (np.clip(view.colour, 0.0, 1.0) * 255).astype(np.uint8)
 
 

@@ -78,6 +78,21 @@ def exp(xi: ArrayLike) -> Array:
     return from_rotation_translation(rotation_exp(xi[3:]), _left_jacobian(xi[3:]) @ xi[:3])
 
 
+def fractions(xi: ArrayLike, shares: ArrayLike) -> Array:
+    """(n, 4, 4) exp(s xi) for each share s (n,) of one motion."""
+    xi = np.asarray(xi, dtype=np.float64)
+    share = np.asarray(shares, dtype=np.float64)[:, None, None]
+    angle = float(np.linalg.norm(xi[3:]))
+    coefficients = [_coefficients(abs(float(s)) * angle) for s in share.ravel()]
+    a, b, c = np.array(coefficients).reshape(-1, 3).T[:, :, None, None]
+    once, twice = share * hat(xi[3:]), share**2 * (hat(xi[3:]) @ hat(xi[3:]))
+    result = np.tile(np.eye(4), (len(share), 1, 1))
+    result[:, :3, :3] += a * once + b * twice
+    jacobian = np.eye(3) + b * once + c * twice
+    result[:, :3, 3:] = jacobian @ (share * xi[:3, None])
+    return result
+
+
 def log(transform: ArrayLike) -> Array:
     """The (6,) tangent vector (rho, phi) of a transform."""
     transform = np.asarray(transform, dtype=np.float64)

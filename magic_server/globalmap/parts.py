@@ -16,6 +16,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from magic_core.config import to_mapping
 from magic_core.gaussians import GaussianCloud, codec
 from magic_server.globalmap.config import MergeConfig
@@ -76,7 +78,7 @@ def fingerprint_of(sources: Sequence[PlacedSource], config: MergeConfig) -> str:
     digest = hashlib.sha256(json.dumps(to_mapping(config), sort_keys=True).encode())
     for source in sources:
         digest.update(source.world_from_anchor.tobytes())
-        digest.update(len(source.keyframe_poses()).to_bytes(4, "little"))
+        digest.update(np.stack(source.keyframe_poses()).tobytes())
     return digest.hexdigest()
 
 

@@ -15,9 +15,11 @@ from magicslam.v1 import submap_pb2
 
 from magic_core.errors import MagicError
 from magic_core.geometry import Camera
+from magic_core.geometry.seams import NO_SEAMS, Seams
 from magic_core.wire import geometry, images
 from magic_server.jobs.attempt import Attempt, made_whole
 from magic_server.jobs.delivery import Delivery, FolderDelivery, JobFile, SpacedReports
+from magic_server.seams import shares_of
 from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ class PlacedFiles:
     name: str
     stored: StoredSubmap
     world_from_anchor: np.ndarray  # (4, 4)
+    seams: Seams = NO_SEAMS
+    """What its neighbours ask of its frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +61,13 @@ class StoredSource:
     stored: StoredSubmap
     header: submap_pb2.SubmapHeader
     world_from_anchor: np.ndarray  # (4, 4)
+    seams: Seams = NO_SEAMS
 
     @classmethod
     def of(cls, placed: PlacedFiles) -> StoredSource:
         """Read the header alone."""
         header = submap_pb2.SubmapHeader.FromString(placed.stored.header)
-        return cls(placed.stored, header, placed.world_from_anchor)
+        return cls(placed.stored, header, placed.world_from_anchor, placed.seams)
 
     @property
     def camera(self) -> Camera:
@@ -83,8 +88,11 @@ class StoredSource:
         return codec.gaussian_count(blob.head(codec.HEADER_BYTES))
 
     def keyframe_poses(self) -> list[np.ndarray]:
-        """anchor_from_camera (4, 4) of every keyframe."""
-        return [geometry.pose_from_proto(item.anchor_from_camera) for item in self.header.keyframes]
+        """anchor_from_camera (4, 4) of every keyframe, with what its seams ask of it."""
+        keyframes = self.header.keyframes
+        share = shares_of(self.header.trajectory)
+        tracked = [geometry.pose_from_proto(item.anchor_from_camera) for item in keyframes]
+        return list(self.seams.spread(tracked, [share[item.frame_index] for item in keyframes]))
 
     def images(self, keyframe: int) -> tuple[np.ndarray, np.ndarray]:
         """Colour (h, w, 3) and depth (h, w) in metres of one keyframe."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
@@ -14,6 +15,7 @@ from magicslam.v1 import mapping_service_pb2_grpc as mapping_grpc
 from magicslam.v1 import submap_pb2
 
 from magic_core.errors import FieldViolation, InvalidInput
+from magic_core.geometry.seams import Seams
 from magic_core.wire import MAX_CHUNK_BYTES, convert, geometry, names, records
 from magic_core.wire.header_check import request_id_problem
 from magic_core.wire.submap import decode_trajectory
@@ -22,6 +24,7 @@ from magic_server.coordinator import SessionCoordinator
 from magic_server.localizing import Localizer
 from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
+from magic_server.seams import seams_of, shares_of
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.sessions import Sessions
 from magic_server.store import Asked, Store, require_model
@@ -176,12 +179,15 @@ class MappingServicer(mapping_grpc.MappingServiceServicer):
         await coordinator.placed(request.agent, timeout_s=request.wait_s)
         snapshot = coordinator.board.of_agent(request.agent)
         loop = asyncio.get_running_loop()
+        odometry_of = coordinator.graph.odometry_of
+        seams = await loop.run_in_executor(self._threads, seams_of, snapshot.poses, odometry_of)
         for pose in snapshot.poses:
             index = names.parse_submap(pose.submap)[2]
             stored = await self._store.submaps.stored(row.session, agent, index)
-            yield await loop.run_in_executor(
-                self._threads, _trajectory_part, pose, stored.header, snapshot.revision
+            part = functools.partial(
+                _trajectory_part, pose, stored.header, snapshot.revision, seams=seams[pose.submap]
             )
+            yield await loop.run_in_executor(self._threads, part)
 
     async def Localize(  # noqa: N802
         self, request: mapping_pb.LocalizeRequest, context: Context
@@ -255,18 +261,17 @@ def _snapshot(coordinator: SessionCoordinator, agent: str) -> mapping_pb.PoseSna
 
 
 def _trajectory_part(
-    pose: mapping_pb.CorrectedPose, header: bytes, revision: int
+    pose: mapping_pb.CorrectedPose, header: bytes, revision: int, *, seams: Seams
 ) -> mapping_pb.GetTrajectoryResponse:
-    """The corrected frames of one sub-map: world_from_anchor @ anchor_from_camera."""
+    """The corrected frames of one sub-map, with what its seams ask of them."""
     world_from_anchor = geometry.pose_from_proto(pose.world_from_anchor)
+    tracked = decode_trajectory(submap_pb2.SubmapHeader.FromString(header))
+    anchor_from_cameras = seams.spread(
+        [frame.anchor_from_camera for frame in tracked], list(shares_of(tracked).values())
+    )
     frames = tuple(
-        records.CorrectedFrame(
-            frame.frame_index,
-            frame.timestamp_s,
-            world_from_anchor @ frame.anchor_from_camera,
-            frame.lost,
-        )
-        for frame in decode_trajectory(submap_pb2.SubmapHeader.FromString(header))
+        records.CorrectedFrame(frame.frame_index, frame.timestamp_s, camera, frame.lost)
+        for frame, camera in zip(tracked, world_from_anchor @ anchor_from_cameras, strict=True)
     )
     return convert.trajectory_part_to_proto(
         records.TrajectoryPart(pose.submap, pose.component, revision, frames)

@@ -19,6 +19,7 @@ from magic_agent.client import ClientConfig, MagicClient
 from magic_core.errors import AlreadyExists, DescriptorModelMismatch, InvalidInput, NotFound
 from magic_core.gaussians.ply import read_ply
 from magic_core.geometry import se3
+from magic_core.geometry.seams import seams_between
 from magic_core.submap import Descriptor
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
@@ -114,18 +115,29 @@ async def test_one_agents_poses_can_be_asked_for_alone(mapped) -> None:
     assert alone.components == everything.components
 
 
-async def test_a_trajectory_is_anchor_times_frame(mapped) -> None:
+async def test_a_trajectory_is_anchor_times_frame_spread_between_neighbours(mapped) -> None:
     _, client, _ = mapped
     snapshot = await client.get_corrected_poses("room")
     parts = await client.get_trajectory("room", "agent_1")
     assert [part.submap for part in parts] == [name_of(1, i) for i in range(SUBMAPS)]
+    anchors = {i: snapshot.poses[part.submap].world_from_anchor for i, part in enumerate(parts)}
+    edges = {i: submap_of(1, i).odometry for i in range(1, SUBMAPS)}
+    motions = {i: (e.previous_index, e.previous_from_anchor) for i, e in edges.items() if e}
+    seams = seams_between(anchors, motions)
+    moved_m = 0.0
     for index, part in enumerate(parts):
         corrected = snapshot.poses[part.submap]
         assert (part.revision, part.component) == (snapshot.revision, corrected.component)
-        for sent, frame in zip(submap_of(1, index).trajectory, part.frames, strict=True):
-            assert (frame.frame_index, frame.lost) == (sent.frame_index, sent.lost)
-            expected = corrected.world_from_anchor @ sent.anchor_from_camera
-            np.testing.assert_allclose(frame.world_from_camera, expected, atol=1e-9)
+        sent = submap_of(1, index).trajectory
+        tracked = np.stack([frame.anchor_from_camera for frame in sent])
+        rigid = corrected.world_from_anchor @ tracked
+        shares = np.arange(len(sent)) / len(sent)
+        expected = corrected.world_from_anchor @ seams[index].spread(tracked, shares)
+        moved_m = max(moved_m, float(np.abs(expected - rigid)[:, :3, 3].max()))
+        for was, pose, frame in zip(sent, expected, part.frames, strict=True):
+            assert (frame.frame_index, frame.lost) == (was.frame_index, was.lost)
+            np.testing.assert_allclose(frame.world_from_camera, pose, atol=1e-9)
+    assert moved_m > 1e-6  # the loops did correct something
 
 
 async def test_every_candidate_ends_with_a_verdict_and_a_reason(mapped) -> None:

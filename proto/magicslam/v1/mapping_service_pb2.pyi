@@ -810,7 +810,9 @@ class CorrectedFrame(_message.Message):
     """True when tracking was lost and the pose is a guess."""
     @_builtins.property
     def world_from_camera(self) -> _geometry_pb2.Pose:
-        """Maps points of the camera to the component's world, metres."""
+        """Maps points of the camera to the component's world, metres. What a correction changed between two
+        successive sub-maps is spread over the frames around their seam (docs/conventions.md).
+        """
 
     def __init__(
         self,
