@@ -199,6 +199,16 @@ def _submap(
     keyframe = Keyframe(0, 0.0, se3.identity(), colour, depth)
     step = se3.from_rotation_translation(np.eye(3), [0.0, 0.0, 2.0])
     previous = (index - 1, step) if index else None
-    times = tuple(0.1 * k for k in range(frames))
-    extent = extent_of(cloud, path)
-    return SubmapView(name, agent, index, camera, cloud, path, times, (keyframe,), previous, extent)
+    return SubmapView(
+        name=name,
+        agent=agent,
+        index=index,
+        camera=camera,
+        cloud=cloud,
+        path=path,
+        times_s=tuple(0.1 * k for k in range(frames)),
+        frame_indices=tuple(range(frames)),
+        keyframes=(keyframe,),
+        previous=previous,
+        extent=extent_of(cloud, path),
+    )
