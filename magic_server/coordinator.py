@@ -28,7 +28,7 @@ from magic_server.jobs import JobExecutor
 from magic_server.jobs.tasks import verify_loop
 from magic_server.loops import LoopCandidate, SubmapKey, left_over, select_candidates
 from magic_server.metrics import Metrics
-from magic_server.places import LocalPlaces, Places
+from magic_server.places import Hit, LocalPlaces, Place, Places
 from magic_server.poseboard import PoseBoard
 from magic_server.pruning import without
 from magic_server.solving import Solving
@@ -94,7 +94,7 @@ class SessionCoordinator:
             self.graph.add_vertex(vertex)
             if not vertex.searched:
                 self._arrived.append(vertex)
-        await self._places.load([(v.name, v.descriptor.vector) for v in vertices if v.searched])
+        await self._places.load([_place(vertex) for vertex in vertices if vertex.searched])
         for removed in await self._store.submaps.removed(self.session):
             self.graph.add_removed(removed)
         for loop in await self._store.loops.all(self.session):
@@ -220,11 +220,11 @@ class SessionCoordinator:
         self, vector: np.ndarray, *, count: int, min_similarity: float
     ) -> list[records.LoopCandidate]:
         """The sub-maps most similar to a raw descriptor (d,), best first."""
-        hits = await self._places.nearest(vector, count)
+        hits = await self._places.nearest(vector[None], count)
         return [
-            records.LoopCandidate("", name, similarity, "SIMILAR", "NOT_VERIFIED")
-            for name, similarity in hits
-            if similarity >= min_similarity
+            _candidate("", hit, "SIMILAR", "NOT_VERIFIED")
+            for hit in hits
+            if hit.similarity >= min_similarity
         ]
 
     # Search: which pairs look alike
@@ -254,21 +254,18 @@ class SessionCoordinator:
         if vertex.name not in self.graph:
             return  # deleted meanwhile
         config = self._config.loops
-        vector = vertex.descriptor.vector
-        hits = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
-        await self._places.add(vertex.name, vector)  # it is there when the disk was full before
+        hits = await self._places.nearest(_views(vertex), config.top_k * QUERY_MARGIN)
+        await self._places.add(_place(vertex))  # it is there when the disk was full before
         chosen = select_candidates(
             self._key(vertex.name),
-            [(self._key(name), similarity) for name, similarity in hits],
+            [(self._key(hit.name), hit.similarity) for hit in hits],
             config,
             model_id=self.session.model_id,
             is_known_pair=self.graph.knows_pair,
         )
         chosen += await self._chosen_by_older(vertex, hits, chosen)
-        found = [
-            records.LoopCandidate(c.query.name, c.hit.name, c.similarity, "PENDING", "PENDING")
-            for c in chosen
-        ]
+        hit_of = {hit.name: hit for hit in hits}
+        found = [_pending(vertex, hit_of[candidate.hit.name]) for candidate in chosen]
         await self._store.loops.add_candidates(self.session, vertex.name, found)
         for loop in found:
             self.graph.set_loop(loop)
@@ -277,21 +274,21 @@ class SessionCoordinator:
         self._notify()
 
     async def _chosen_by_older(
-        self, vertex: Vertex, hits: list[tuple[str, float]], chosen: list[LoopCandidate]
+        self, vertex: Vertex, hits: list[Hit], chosen: list[LoopCandidate]
     ) -> list[LoopCandidate]:
         """Older sub-maps that would choose the new one, where it had no room for them."""
         config, model_id = self._config.loops, self.session.model_id
-        keys = [(self._key(name), similarity) for name, similarity in hits]
+        keys = [(self._key(hit.name), hit.similarity) for hit in hits]
         query = self._key(vertex.name)
         found = []
         for candidate in left_over(
             query, keys, chosen, config, model_id=model_id, is_known_pair=self.graph.knows_pair
         ):
-            vector = self.graph.descriptor_of(candidate.hit.name)
-            around = await self._places.nearest(vector, config.top_k * QUERY_MARGIN)
+            views = _views(self.graph.vertex(candidate.hit.name))
+            around = await self._places.nearest(views, config.top_k * QUERY_MARGIN)
             would = select_candidates(
                 candidate.hit,
-                [(self._key(name), similarity) for name, similarity in around],
+                [(self._key(hit.name), hit.similarity) for hit in around],
                 config,
                 model_id=model_id,
             )
@@ -333,7 +330,9 @@ class SessionCoordinator:
         """The candidate with its verdict; a job that fails is a refusal with its own reason."""
         try:
             source, target = await self._stored(loop.source), await self._stored(loop.target)
-            result = await self._jobs.run(verify_loop, source, target, self._config.registration)
+            keyframes = loop.source_keyframe, loop.target_keyframe
+            config = self._config.registration
+            result = await self._jobs.run(verify_loop, source, target, config, keyframes)
         except Exception as error:
             logger.exception("verification of %s -> %s failed", loop.source, loop.target)
             damaged = isinstance(error, CorruptData)
@@ -391,3 +390,27 @@ class SessionCoordinator:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _place(vertex: Vertex) -> Place:
+    return Place(vertex.name, vertex.descriptor.vector, vertex.keyframes)
+
+
+def _views(vertex: Vertex) -> np.ndarray:
+    """The descriptors (n, d) by which a sub-map looks for others, the anchor's first."""
+    return np.stack([vertex.descriptor.vector, *(vector for _, vector in vertex.keyframes)])
+
+
+def _pending(vertex: Vertex, hit: Hit) -> records.LoopCandidate:
+    """A candidate that waits for its verification."""
+    places = (0, *(place for place, _ in vertex.keyframes))
+    found = _candidate(vertex.name, hit, "PENDING", "PENDING")
+    return dataclasses.replace(found, source_keyframe=places[hit.query])
+
+
+def _candidate(
+    source: str, hit: Hit, verdict: records.Verdict, reason: str
+) -> records.LoopCandidate:
+    return records.LoopCandidate(
+        source, hit.name, hit.similarity, verdict, reason, target_keyframe=hit.keyframe
+    )

@@ -63,9 +63,9 @@ class SessionGraph:
         """The sub-maps of an agent, all by resource name."""
         return {vertex.name for vertex in self._vertices.values() if vertex.agent == agent}
 
-    def descriptor_of(self, submap: str) -> np.ndarray:
-        """The anchor's descriptor (d,) of a sub-map by resource name."""
-        return self._vertices[submap].descriptor.vector
+    def vertex(self, submap: str) -> Vertex:
+        """A sub-map by resource name."""
+        return self._vertices[submap]
 
     def span_of(self, submap: str) -> tuple[float, float] | None:
         """Timestamps of a sub-map's first and last frame; None for one that is gone."""

@@ -32,6 +32,8 @@ class _Candidate:
     similarity: float
     pose: mapping_pb.CorrectedPose
     stored: StoredSubmap
+    keyframe: int
+    """Which of its keyframes looks like the image; 0 is the anchor."""
 
 
 class Localizer:
@@ -66,8 +68,9 @@ class Localizer:
             require_model(coordinator.session, descriptor.model_id, len(descriptor.vector))
             candidates = await self._candidates(descriptor, coordinator)
             stored = tuple(candidate.stored for candidate in candidates)
+            keyframes = tuple(candidate.keyframe for candidate in candidates)
             registration = self._config.registration
-            results = await self._jobs.run(localize_image, image, stored, registration)
+            results = await self._jobs.run(localize_image, image, stored, registration, keyframes)
         finally:
             self._under_way -= 1
         return _answer(candidates, results, coordinator)
@@ -94,7 +97,8 @@ class Localizer:
         for hit in alike:
             _, agent, index = names.parse_submap(hit.target)
             stored = await self._store.submaps.stored(coordinator.session, agent, index)
-            found.append(_Candidate(hit.similarity, placed[hit.target], stored))
+            place = placed[hit.target]
+            found.append(_Candidate(hit.similarity, place, stored, hit.target_keyframe))
         return found
 
     async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -28,7 +28,7 @@ from magic_core.errors import (
     WrongState,
 )
 from magic_core.wire import check_blob, check_chunk, check_header, geometry, names
-from magic_core.wire.submap import decode_odometry
+from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
 from magic_server.config import ServiceLimits
 from magic_server.quotas import Quotas
 from magic_server.store import (
@@ -355,6 +355,7 @@ class Upload:
             prior=prior,
             searched=False,
             span_s=(frames[0].timestamp_s, frames[-1].timestamp_s),
+            keyframes=decode_keyframe_descriptors(self.header),
         )
         return NewSubmap(
             header=self.header,

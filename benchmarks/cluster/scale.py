@@ -56,7 +56,7 @@ def spread(seconds: list[float]) -> dict:
 
 def measure_descriptors(size: int, *, dimension: int, queries: int) -> dict:
     """Fill the index with one descriptor per sub-map, ten of each place; then ask it."""
-    from magic_server.places import DescriptorIndex
+    from magic_server.places import DescriptorIndex, Place
 
     generator = np.random.default_rng(0)
     places = generator.normal(size=(max(size // 10, 1), dimension)).astype(np.float32)
@@ -73,7 +73,8 @@ def measure_descriptors(size: int, *, dimension: int, queries: int) -> dict:
         numbers = np.arange(first, min(first + chunk, size))
         vectors = list(seen(numbers))
         started = time.process_time()
-        index.load([f"sessions/s/agents/a{n % AGENTS}/submaps/{n}" for n in numbers], vectors)
+        submaps = [f"sessions/s/agents/a{n % AGENTS}/submaps/{n}" for n in numbers]
+        index.load([Place(*one) for one in zip(submaps, vectors, strict=True)])
         load_s += time.process_time() - started
     asked = generator.integers(0, len(places), queries)
     times, found, possible = [], 0, 0
@@ -82,12 +83,12 @@ def measure_descriptors(size: int, *, dimension: int, queries: int) -> dict:
         hits = index.query(vector, WANTED)
         times.append(time.process_time() - started)
         right = set(range(number, size, len(places)))
-        found += len(right & {int(name.rpartition("/")[2]) for name, _ in hits})
+        found += len(right & {int(hit.name.rpartition("/")[2]) for hit in hits})
         possible += len(right)
     adds = []
     for extra, vector in enumerate(seen(generator.integers(0, len(places), 200))):
         started = time.process_time()
-        index.add(f"extra/{extra}", vector)
+        index.add(Place(f"extra/{extra}", vector))
         adds.append(time.process_time() - started)
     return {
         "part": "descriptors",

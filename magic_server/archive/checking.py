@@ -13,7 +13,7 @@ from magicslam.v1 import session_service_pb2 as session_pb
 from magic_core.errors import CorruptData, InvalidInput, MagicError
 from magic_core.wire import SubmapLimits, check_blob, check_header, convert, geometry, names
 from magic_core.wire.header_check import request_id_problem
-from magic_core.wire.submap import decode_odometry
+from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
 from magic_server.store import ImportedSubmap, NewSubmap, Vertex, WrittenBlob, require_model
 from magic_server.store.rows import SessionRow
 
@@ -36,10 +36,11 @@ def check_archive(
         with _field(f"submaps[{index}]"):
             submaps.append(_submap(entry, session, numbers, blobs, limits))
     stored = {one.submap.vertex.name for one in submaps}
+    keyframes = {one.submap.vertex.name: len(one.submap.header.keyframes) for one in submaps}
     for index, entry in enumerate(archive.removed):
         with _field(f"removed[{index}]"):
             _check_removed(entry, numbers)
-    _check_loops(archive, stored)
+    _check_loops(archive, keyframes)
     _check_snapshot(archive, stored)
     for index, entry in enumerate(archive.maps):
         with _field(f"maps[{index}]"):
@@ -135,6 +136,7 @@ def _submap(
         prior=prior,
         searched=entry.searched,
         span_s=(header.trajectory[0].timestamp_s, header.trajectory[-1].timestamp_s),
+        keyframes=decode_keyframe_descriptors(header),
     )
     submap = NewSubmap(
         header=header,
@@ -175,14 +177,20 @@ def _check_removed(entry: archive_pb2.ArchivedRemoval, numbers: set[tuple[str, i
         geometry.pose_from_proto(entry.world_from_anchor_prior, field="world_from_anchor_prior")
 
 
-def _check_loops(archive: archive_pb2.SessionArchive, stored: set[str]) -> None:
+def _check_loops(archive: archive_pb2.SessionArchive, keyframes: Mapping[str, int]) -> None:
+    """`keyframes` holds how many each stored sub-map has."""
     seen: set[tuple[str, str]] = set()
     for index, message in enumerate(archive.loops):
         with _field(f"loops[{index}]"):
             ends = message.source, message.target
-            known = {*ends} <= stored and message.source != message.target and ends not in seen
+            apart = message.source != message.target and ends not in seen
+            known = {*ends} <= keyframes.keys() and apart
             _require(known, "source", "joins what is not in the archive, or twice")
             seen.add(ends)
+            for end, name in (("source", message.source), ("target", message.target)):
+                field = f"{end}_keyframe"
+                there = getattr(message, field) < keyframes[name]
+                _require(there, field, f"{name} has {keyframes[name]} keyframes")
             accepted = message.verdict == 2
             measured = message.HasField("target_from_source")
             _require(accepted == measured, "target_from_source", "belongs to accepted loops")

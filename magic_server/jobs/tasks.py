@@ -173,19 +173,27 @@ def append_submaps(task: PreviewTask) -> PreviewOutcome:
 
 
 def verify_loop(
-    source: StoredSubmap, target: StoredSubmap, config: RegistrationConfig
+    source: StoredSubmap,
+    target: StoredSubmap,
+    config: RegistrationConfig,
+    keyframes: tuple[int, int],
 ) -> RegistrationResult:
-    """Register the views of two sub-maps."""
+    """Register the views of two sub-maps; `keyframes` are those of each that look alike."""
     from magic_server.registration.register import register
 
-    return register(_prepared(source, config), _prepared(target, config), config)
+    seen, known = keyframes
+    return register(_prepared(source, seen, config), _prepared(target, known, config), config)
 
 
 def localize_image(
-    image: QueryImage, targets: tuple[StoredSubmap, ...], config: RegistrationConfig
+    image: QueryImage,
+    targets: tuple[StoredSubmap, ...],
+    config: RegistrationConfig,
+    keyframes: tuple[int, ...],
 ) -> list[RegistrationResult | None]:
     """Register an image to sub-maps, up to and with the first that accepts it.
 
+    `keyframes` holds which keyframe of each looks like the image.
     The result of each is target_from_camera, None where a sub-map could not be read.
     """
     from magic_server.registration import prepare
@@ -193,9 +201,9 @@ def localize_image(
 
     view = prepare(_query_view(image), config)
     results: list[RegistrationResult | None] = []
-    for target in targets:
+    for target, keyframe in zip(targets, keyframes, strict=True):
         try:
-            prepared = _prepared(target, config)
+            prepared = _prepared(target, keyframe, config)
         except (OSError, MagicError):  # deleted meanwhile, or damaged on disk
             results.append(None)
             continue
@@ -254,11 +262,13 @@ def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
 
 
 @functools.lru_cache(maxsize=16)
-def _prepared(stored: StoredSubmap, config: RegistrationConfig) -> PreparedView:
+def _prepared(stored: StoredSubmap, keyframe: int, config: RegistrationConfig) -> PreparedView:
     """A sub-map's view; kept, because a new sub-map is compared with several others in a row."""
     from magic_server.registration import prepare
 
-    return prepare(_view(stored, config), config)
+    if keyframe and not config.max_keyframes:
+        config = dataclasses.replace(config, max_keyframes=1)
+    return prepare(_view(stored, keyframe, config), config)
 
 
 def _query_view(image: QueryImage) -> AnchorView:
@@ -271,8 +281,9 @@ def _query_view(image: QueryImage) -> AnchorView:
     return AnchorView(camera=image.camera, colour=colour, depth=depth)
 
 
-def _view(stored: StoredSubmap, config: RegistrationConfig) -> AnchorView:
-    """What registration wants of a sub-map: the images of the anchor and of some keyframes."""
+def _view(stored: StoredSubmap, keyframe: int, config: RegistrationConfig) -> AnchorView:
+    """What registration wants of a sub-map: the images of the anchor, of the keyframe that looks
+    like the other side (unless it is the anchor), and of some others."""
     from magic_server.registration import AnchorView
 
     header = submap_pb2.SubmapHeader.FromString(stored.header)
@@ -281,6 +292,8 @@ def _view(stored: StoredSubmap, config: RegistrationConfig) -> AnchorView:
     if len(others) > config.max_keyframes:
         spread = np.linspace(1, len(header.keyframes) - 1, config.max_keyframes)
         others = sorted(set(np.rint(spread).astype(int).tolist()))
+    if keyframe:  # in front: the coarse methods on points see the first images only
+        others = [keyframe, *(other for other in others if other != keyframe)]
     colour, depth = _images(header, stored, 0)
     keyframes = []
     for index in others:

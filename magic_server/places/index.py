@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magic_core.errors import AlreadyExists, InvalidInput, NotFound
+from magic_server.places.hits import Hit, Place, best_of_each
 
 EXACT_LIMIT = 100_000
 TRAINING_VECTORS_PER_LIST = 50
@@ -23,7 +24,10 @@ BLAS_THRESHOLD = 3072
 
 
 class DescriptorIndex:
-    """Unit vectors of one encoder under their names. Not thread-safe: one owner."""
+    """Unit vectors of one encoder under their names. Not thread-safe: one owner.
+
+    A name may have several vectors, its anchor's and those of keyframes; it is found by the best.
+    """
 
     def __init__(self, dimension: int, *, exact_limit: int = EXACT_LIMIT) -> None:
         if dimension < 1:
@@ -36,8 +40,11 @@ class DescriptorIndex:
         self._exact_limit = exact_limit
         self._index: Any = faiss.IndexIDMap2(faiss.IndexFlatIP(dimension))
         self._is_exact = True
-        self._id_of: dict[str, int] = {}
+        self._id_of: dict[str, int] = {}  # of the anchor
         self._name_of: dict[int, str] = {}
+        # Of keyframes alone, so that they cost nothing where there are none.
+        self._others_of: dict[str, tuple[int, ...]] = {}
+        self._keyframe_of: dict[int, int] = {}
         self._next_id = 0
 
     def __len__(self) -> int:
@@ -51,66 +58,100 @@ class DescriptorIndex:
         """Whether every query compares with every vector."""
         return self._is_exact
 
-    def add(self, name: str, vector: ArrayLike) -> None:
-        """Store a vector (dimension,); it is normalised. Raises AlreadyExists for a known name."""
-        if name in self._id_of:
-            raise AlreadyExists(f"descriptor {name!r} is in the index already; remove it first")
-        row = self._unit_row(vector)
-        identifier, self._next_id = self._next_id, self._next_id + 1
-        self._index.add_with_ids(row, np.array([identifier], dtype=np.int64))
-        self._id_of[name] = identifier
-        self._name_of[identifier] = name
-        if self._is_exact and len(self) > self._exact_limit:
-            self._become_inverted_file()
+    @property
+    def vectors(self) -> int:
+        """How many vectors there are, those of keyframes included."""
+        return len(self._name_of)
 
-    def load(self, names: Sequence[str], vectors: Sequence[ArrayLike]) -> None:
-        """Store many (dimension,) at once: one by one, a million take an inverted file minutes.
+    def add(self, place: Place) -> None:
+        """Store the vectors (dimension,) of a place, normalised.
 
         Raises AlreadyExists for a known name, before anything is stored.
         """
-        known = set(names)
-        if len(known) < len(names) or not known.isdisjoint(self._id_of):
-            raise AlreadyExists("descriptors under one name twice, or in the index already")
-        for first in range(0, len(names), LOADED_AT_ONCE):
-            chunk = names[first : first + LOADED_AT_ONCE]
-            rows = [self._unit_row(v) for v in vectors[first : first + LOADED_AT_ONCE]]
-            identifiers = np.arange(self._next_id, self._next_id + len(chunk))
-            self._index.add_with_ids(np.concatenate(rows), identifiers)
-            self._next_id += len(chunk)
-            self._id_of.update(zip(chunk, identifiers.tolist(), strict=True))
-            self._name_of.update(zip(identifiers.tolist(), chunk, strict=True))
-            if self._is_exact and len(self) > self._exact_limit:
+        self.load([place])
+
+    def load(self, places: Sequence[Place]) -> None:
+        """Store many places at once: one by one, a million take an inverted file minutes.
+
+        Raises AlreadyExists for a known name, before anything is stored.
+        """
+        if held := [place.name for place in places if place.name in self._id_of]:
+            raise AlreadyExists(f"descriptor {held[0]!r} is in the index already; remove it first")
+        if len({place.name for place in places}) < len(places):
+            raise AlreadyExists("descriptors under one name twice")
+        for first in range(0, len(places), LOADED_AT_ONCE):
+            self._store(places[first : first + LOADED_AT_ONCE])
+            if self._is_exact and self.vectors > self._exact_limit:
                 self._become_inverted_file()
 
     def remove(self, name: str) -> None:
-        """Forget a vector. Raises NotFound for an unknown name."""
+        """Forget a place with all its vectors. Raises NotFound for an unknown name."""
         if name not in self._id_of:
             raise NotFound(f"descriptor {name!r} is not in the index")
-        identifier = self._id_of.pop(name)
-        del self._name_of[identifier]
-        self._index.remove_ids(np.array([identifier], dtype=np.int64))
+        identifiers = [self._id_of.pop(name), *self._others_of.pop(name, ())]
+        for identifier in identifiers:
+            del self._name_of[identifier]
+            self._keyframe_of.pop(identifier, None)
+        self._index.remove_ids(np.array(identifiers, dtype=np.int64))
 
     def query(
-        self, vector: ArrayLike, k: int, *, among: Collection[str] | None = None
-    ) -> list[tuple[str, float]]:
-        """The k nearest names with their cosine similarity, best first, ties by age.
+        self, vectors: ArrayLike, k: int, *, among: Collection[str] | None = None
+    ) -> list[Hit]:
+        """The k nearest places to a vector (dimension,), or to the nearest of several (n,
+        dimension): each once with its best similarity, best first, ties by age.
 
         `among` keeps the search to some names (of one session, say); unknown ones are ignored.
         """
         if k < 1 or not self._id_of:
             return []
+        rows = np.asarray(vectors, dtype=np.float32)
+        rows = np.concatenate([self._unit_row(row) for row in (rows if rows.ndim > 1 else [rows])])
         parameters = self._parameters(among)
-        wanted = min(k, len(self))
-        similarities, identifiers = self._index.search(
-            self._unit_row(vector), wanted, params=parameters
+        wanted = min(k, self.vectors)
+        while True:
+            similarities, identifiers = self._index.search(rows, wanted, params=parameters)
+            found = [
+                (-float(similarity), int(identifier), query)
+                for query in range(len(rows))
+                for identifier, similarity in zip(
+                    identifiers[query], similarities[query], strict=True
+                )
+                if identifier >= 0
+            ]
+            # Several vectors of one place take several of the neighbours: then ask for more.
+            if wanted == self.vectors or self._are_enough(identifiers, k):
+                return best_of_each(map(self._hit, sorted(found)), k)
+            wanted = min(2 * wanted, self.vectors)
+
+    def _are_enough(self, identifiers: NDArray[np.int64], k: int) -> bool:
+        """Whether each query has found k places, or everything that it can."""
+        return all(
+            row[-1] < 0 or len({self._name_of[identifier] for identifier in row.tolist()}) >= k
+            for row in identifiers
         )
-        found = [
-            (int(identifier), float(similarity))
-            for identifier, similarity in zip(identifiers[0], similarities[0], strict=True)
-            if identifier >= 0
+
+    def _hit(self, found: tuple[float, int, int]) -> Hit:
+        negative, identifier, query = found
+        keyframe = self._keyframe_of.get(identifier, 0)
+        return Hit(self._name_of[identifier], -negative, keyframe, query)
+
+    def _store(self, places: Sequence[Place]) -> None:
+        rows = [
+            self._unit_row(vector)
+            for place in places
+            for vector in (place.vector, *(other for _, other in place.keyframes))
         ]
-        found.sort(key=lambda hit: (-hit[1], hit[0]))
-        return [(self._name_of[identifier], similarity) for identifier, similarity in found]
+        identifiers = np.arange(self._next_id, self._next_id + len(rows))
+        self._index.add_with_ids(np.concatenate(rows), identifiers)
+        for place in places:
+            first, self._next_id = self._next_id, self._next_id + 1 + len(place.keyframes)
+            self._id_of[place.name] = first
+            for identifier in range(first, self._next_id):
+                self._name_of[identifier] = place.name
+            if place.keyframes:
+                self._others_of[place.name] = tuple(range(first + 1, self._next_id))
+            for identifier, (keyframe, _) in enumerate(place.keyframes, first + 1):
+                self._keyframe_of[identifier] = keyframe
 
     def _unit_row(self, vector: ArrayLike) -> NDArray[np.float32]:
         row = np.asarray(vector, dtype=np.float32).reshape(1, -1)
@@ -126,7 +167,9 @@ class DescriptorIndex:
     def _parameters(self, among: Collection[str] | None) -> Any:
         selector = None
         if among is not None:
-            allowed = [self._id_of[name] for name in among if name in self._id_of]
+            known = [name for name in among if name in self._id_of]
+            allowed = [self._id_of[name] for name in known]
+            allowed += [other for name in known for other in self._others_of.get(name, ())]
             selector = self._faiss.IDSelectorBatch(np.array(allowed, dtype=np.int64))
         if not self._is_exact:
             return self._faiss.SearchParametersIVF(nprobe=LISTS_PROBED, sel=selector)

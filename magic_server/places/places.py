@@ -9,20 +9,18 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from magic_server.places.hits import Hit, Place
 from magic_server.places.index import DescriptorIndex
-
-Named = tuple[str, np.ndarray]
-"""The resource name of a sub-map, and its descriptor (d,)."""
 
 
 class Places(Protocol):
     """The descriptors of one session's sub-maps."""
 
-    async def load(self, vectors: Sequence[Named]) -> None:
+    async def load(self, places: Sequence[Place]) -> None:
         """Hold these, and no others."""
         ...
 
-    async def add(self, name: str, vector: np.ndarray) -> None:
+    async def add(self, place: Place) -> None:
         """Hold one more; nothing happens when it is there."""
         ...
 
@@ -30,8 +28,9 @@ class Places(Protocol):
         """Forget some; unknown ones are ignored."""
         ...
 
-    async def nearest(self, vector: np.ndarray, count: int) -> list[tuple[str, float]]:
-        """The nearest names with their cosine similarity, best first, ties by age."""
+    async def nearest(self, vectors: np.ndarray, count: int) -> list[Hit]:
+        """The sub-maps nearest to one of the vectors (n, d), each once with its best similarity,
+        best first, ties by age."""
         ...
 
 
@@ -43,27 +42,27 @@ class LocalPlaces:
         self._threads = threads
         self._lock = asyncio.Lock()
 
-    async def load(self, vectors: Sequence[Named]) -> None:
+    async def load(self, places: Sequence[Place]) -> None:
         """Hold these, and no others; the index must be new."""
-        names = [name for name, _ in vectors]
         async with self._lock:
-            await self._in_thread(self._index.load, names, [vector for _, vector in vectors])
+            await self._in_thread(self._index.load, places)
 
-    async def add(self, name: str, vector: np.ndarray) -> None:
+    async def add(self, place: Place) -> None:
         """Hold one more; nothing happens when it is there."""
         async with self._lock:
-            if name not in self._index:
-                await self._in_thread(self._index.add, name, vector)
+            if place.name not in self._index:
+                await self._in_thread(self._index.add, place)
 
     async def remove(self, names: Collection[str]) -> None:
         """Forget some; unknown ones are ignored."""
         async with self._lock:
             await self._in_thread(_forget, self._index, names)
 
-    async def nearest(self, vector: np.ndarray, count: int) -> list[tuple[str, float]]:
-        """The nearest names with their cosine similarity, best first, ties by age."""
+    async def nearest(self, vectors: np.ndarray, count: int) -> list[Hit]:
+        """The sub-maps nearest to one of the vectors (n, d), each once with its best similarity,
+        best first, ties by age."""
         async with self._lock:
-            return await self._in_thread(self._index.query, vector, count)
+            return await self._in_thread(self._index.query, vectors, count)
 
     async def _in_thread(self, function: Any, *arguments: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

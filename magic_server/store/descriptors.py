@@ -1,9 +1,10 @@
 """Descriptors in PostgreSQL, searched by pgvector.
 
-One table per dimension, `descriptors_{d}`: unit vectors in full precision, and an HNSW index of
-them in half precision. A query takes candidates of one session from the index and orders them by
-the exact inner product. The tables hold nothing that the sub-maps' own rows do not: they may be
-dropped while no server runs, and are filled again.
+One table per dimension, `descriptors_{d}`: unit vectors in full precision, of anchors (keyframe 0)
+and of keyframes that have one, and an HNSW index of them in half precision. A query takes
+candidates of one session from the index and orders them by the exact inner product; a sub-map is
+found once, by its best vector. The tables hold nothing that the sub-maps' own rows do not: they may
+be dropped while no server runs, and are filled again.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import sqlalchemy as sa
+from numpy.typing import ArrayLike
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from magic_core.errors import ConfigError, InvalidInput
 from magic_core.wire import names
+from magic_server.places.hits import Hit, Place, best_of_each
 from magic_server.store.database import Database
 from magic_server.store.rows import SessionRow
 
@@ -60,8 +63,9 @@ class DescriptorTable:
         table = _table(dimension)
         statements = [
             f"CREATE TABLE IF NOT EXISTS {table} ("
-            "submap_id BIGINT PRIMARY KEY REFERENCES submaps (id) ON DELETE CASCADE, "
-            f"session_id BIGINT NOT NULL, embedding vector({dimension}) NOT NULL)",
+            "submap_id BIGINT REFERENCES submaps (id) ON DELETE CASCADE, "
+            f"session_id BIGINT NOT NULL, embedding vector({dimension}) NOT NULL, "
+            "keyframe BIGINT NOT NULL DEFAULT 0, PRIMARY KEY (submap_id, keyframe))",
             f"CREATE INDEX IF NOT EXISTS {table}_session ON {table} (session_id)",
         ]
         if dimension <= MOST_INDEXED:
@@ -97,75 +101,101 @@ class PgvectorPlaces:
         self._session = session
         self._table = _table(session.dimension)
 
-    async def load(self, vectors: Sequence[tuple[str, np.ndarray]]) -> None:
+    async def load(self, places: Sequence[Place]) -> None:
         """Hold these; what the table has already is left as it is."""
         await self._tables.prepare(self._session.dimension)
         held = sa.text(
-            f"SELECT a.name, m.number FROM {self._table} d JOIN submaps m ON m.id = d.submap_id "
-            "JOIN agents a ON a.id = m.agent_id WHERE d.session_id = :session"
+            f"SELECT a.name, m.number, count(*) AS vectors FROM {self._table} d "
+            "JOIN submaps m ON m.id = d.submap_id JOIN agents a ON a.id = m.agent_id "
+            "WHERE d.session_id = :session GROUP BY a.name, m.number"
         )
         async with self._database.read() as connection:
             rows = await connection.execute(held, {"session": self._session.id})
-            known = {names.submap_name(self._session.name, r.name, r.number) for r in rows}
-        missing = [one for one in vectors if one[0] not in known]
+            held_of = {
+                names.submap_name(self._session.name, r.name, r.number): r.vectors for r in rows
+            }
+        missing = [one for one in places if held_of.get(one.name, 0) < 1 + len(one.keyframes)]
         for begin in range(0, len(missing), _BATCH):
             async with self._database.write(self._session.id) as connection:
                 await self._insert(connection, missing[begin : begin + _BATCH])
 
-    async def add(self, name: str, vector: np.ndarray) -> None:
+    async def add(self, place: Place) -> None:
         """Hold one more; nothing happens when it is there."""
         async with self._database.write(self._session.id) as connection:
-            await self._insert(connection, [(name, vector)])
+            await self._insert(connection, [place])
 
     async def remove(self, names: Collection[str]) -> None:
         """Nothing to do: descriptors go with the rows of their sub-maps."""
 
-    async def nearest(self, vector: np.ndarray, count: int) -> list[tuple[str, float]]:
-        """The nearest names with their cosine similarity, best first, ties by age."""
+    async def nearest(self, vectors: np.ndarray, count: int) -> list[Hit]:
+        """The sub-maps nearest to one of the vectors (n, d), each once with its best similarity,
+        best first, ties by age."""
         if count < 1:
             return []
-        asked = min(max(count * CANDIDATES, LEAST_CANDIDATES), _MOST_CANDIDATES)
+        async with self._database.read() as connection:
+            await connection.execute(sa.text("SET LOCAL hnsw.iterative_scan = strict_order"))
+            found = [
+                hit
+                for query, vector in enumerate(np.atleast_2d(vectors))
+                for hit in await self._of_one(connection, query, vector, count)
+            ]
+        return best_of_each(found, count)
+
+    async def _of_one(
+        self, connection: AsyncConnection, query: int, vector: np.ndarray, count: int
+    ) -> list[Hit]:
+        """The `count` sub-maps nearest to a vector."""
         d = self._session.dimension
         half = f"halfvec({d})" if d <= MOST_INDEXED else f"vector({d})"
-        query = sa.text(
+        statement = sa.text(
             "WITH candidates AS MATERIALIZED ("
-            f"SELECT submap_id, embedding FROM {self._table} WHERE session_id = :session "
-            f"ORDER BY embedding::{half} <#> CAST(CAST(:vector AS text) AS {half}) LIMIT :asked) "
-            "SELECT a.name, m.number, "
-            f"-(c.embedding <#> CAST(CAST(:vector AS text) AS vector({d}))) AS similarity "
-            "FROM candidates c JOIN submaps m ON m.id = c.submap_id "
-            "JOIN agents a ON a.id = m.agent_id "
-            "ORDER BY similarity DESC, c.submap_id LIMIT :count"
+            f"SELECT submap_id, keyframe, embedding FROM {self._table} WHERE session_id = :session "
+            f"ORDER BY embedding::{half} <#> CAST(CAST(:vector AS text) AS {half}) LIMIT :asked), "
+            "exact AS (SELECT submap_id, keyframe, "
+            f"-(embedding <#> CAST(CAST(:vector AS text) AS vector({d}))) AS similarity "
+            "FROM candidates), "
+            "best AS (SELECT DISTINCT ON (submap_id) * FROM exact "
+            "ORDER BY submap_id, similarity DESC, keyframe) "
+            "SELECT a.name, m.number, b.keyframe, b.similarity, "
+            "(SELECT count(*) FROM candidates) AS candidates "
+            "FROM best b JOIN submaps m ON m.id = b.submap_id JOIN agents a ON a.id = m.agent_id "
+            "ORDER BY b.similarity DESC, b.submap_id LIMIT :count"
         )
-        values = {"session": self._session.id, "vector": _text(vector, d)}
-        values |= {"asked": max(asked, count), "count": count}
-        async with self._database.read() as connection:
-            await connection.execute(sa.text(f"SET LOCAL hnsw.ef_search = {asked}"))
-            await connection.execute(sa.text("SET LOCAL hnsw.iterative_scan = strict_order"))
-            rows = (await connection.execute(query, values)).all()
-        session = self._session.name
-        return [(names.submap_name(session, r.name, r.number), float(r.similarity)) for r in rows]
+        values = {"session": self._session.id, "vector": _text(vector, d), "count": count}
+        asked = max(count, min(max(count * CANDIDATES, LEAST_CANDIDATES), _MOST_CANDIDATES))
+        while True:
+            breadth = min(asked, _MOST_CANDIDATES)
+            await connection.execute(sa.text(f"SET LOCAL hnsw.ef_search = {breadth}"))
+            rows = (await connection.execute(statement, values | {"asked": asked})).all()
+            if len(rows) == count or not rows or rows[0].candidates < asked:
+                break
+            asked *= 4  # many vectors of few sub-maps: look farther
+        found = [names.submap_name(self._session.name, row.name, row.number) for row in rows]
+        return [
+            Hit(name, float(row.similarity), row.keyframe, query)
+            for name, row in zip(found, rows, strict=True)
+        ]
 
-    async def _insert(
-        self, connection: AsyncConnection, vectors: Sequence[tuple[str, np.ndarray]]
-    ) -> None:
+    async def _insert(self, connection: AsyncConnection, places: Sequence[Place]) -> None:
         d = self._session.dimension
         statement = sa.text(
-            f"INSERT INTO {self._table} (submap_id, session_id, embedding) "
-            f"SELECT m.id, m.session_id, CAST(v.vector AS vector({d})) "
+            f"INSERT INTO {self._table} (submap_id, session_id, keyframe, embedding) "
+            f"SELECT m.id, m.session_id, v.keyframe, CAST(v.vector AS vector({d})) "
             "FROM unnest(CAST(:agents AS text[]), CAST(:numbers AS bigint[]), "
-            "CAST(:vectors AS text[])) AS v (agent, number, vector) "
+            "CAST(:keyframes AS bigint[]), CAST(:vectors AS text[])) "
+            "AS v (agent, number, keyframe, vector) "
             "JOIN agents a ON a.session_id = :session AND a.name = v.agent "
             "JOIN submaps m ON m.agent_id = a.id AND m.number = v.number "
             "ON CONFLICT DO NOTHING"
         )
-        parsed = [names.parse_submap(name) for name, _ in vectors]
-        values = {
-            "session": self._session.id,
-            "agents": [agent for _, agent, _ in parsed],
-            "numbers": [number for _, _, number in parsed],
-            "vectors": [_text(vector, d) for _, vector in vectors],
-        }
+        rows = [
+            (*names.parse_submap(place.name)[1:], keyframe, _text(vector, d))
+            for place in places
+            for keyframe, vector in ((0, place.vector), *place.keyframes)
+        ]
+        agents, numbers, keyframes, vectors = map(list, zip(*rows, strict=True))
+        values = {"session": self._session.id, "agents": agents, "numbers": numbers}
+        values |= {"keyframes": keyframes, "vectors": vectors}
         await connection.execute(statement, values)
 
 
@@ -173,7 +203,7 @@ def _table(dimension: int) -> str:
     return f"descriptors_{int(dimension)}"
 
 
-def _text(vector: np.ndarray, dimension: int) -> str:
+def _text(vector: ArrayLike, dimension: int) -> str:
     """A unit vector as pgvector reads it."""
     row = np.asarray(vector, dtype=np.float32).reshape(-1)
     norm = float(np.linalg.norm(row))

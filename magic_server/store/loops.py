@@ -186,6 +186,8 @@ def loop_columns(loop: records.LoopCandidate) -> dict[str, object]:
         "overlap": loop.overlap,
         "verify_seconds": loop.verify_seconds,
         "kept": loop.kept,
+        "source_keyframe": loop.source_keyframe,
+        "target_keyframe": loop.target_keyframe,
     }
 
 
@@ -205,4 +207,6 @@ def loop_record(row: sa.Row) -> records.LoopCandidate:
         overlap=row.overlap,
         verify_seconds=row.verify_seconds,
         kept=row.kept,
+        source_keyframe=row.source_keyframe,
+        target_keyframe=row.target_keyframe,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from magic_core.submap import Descriptor, OdometryEdge
 from magic_server.store.blob_store import StoredBlob
+
+DescribedKeyframe = tuple[int, NDArray[np.float32]]
+"""Its place among the keyframes of the sub-map's header, and its descriptor (d,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,8 @@ class Vertex:
     """Whether loop candidates were looked for."""
     span_s: tuple[float, float]
     """Timestamps of its first and its last frame, by the agent's clock."""
+    keyframes: tuple[DescribedKeyframe, ...] = ()
+    """Those that have a descriptor of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +104,23 @@ def unpack(data: bytes | None, side: int) -> NDArray[np.float64] | None:
     if data is None:
         return None
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(side, side)
+
+
+def pack_keyframes(keyframes: Sequence[DescribedKeyframe]) -> bytes | None:
+    """Descriptors of keyframes as bytes; None for none."""
+    if not keyframes:
+        return None
+    rows = np.empty(len(keyframes), _keyframe_row(len(keyframes[0][1])))
+    rows["place"] = [place for place, _ in keyframes]
+    rows["vector"] = [vector for _, vector in keyframes]
+    return rows.tobytes()
+
+
+def unpack_keyframes(data: bytes | None, dimension: int) -> tuple[DescribedKeyframe, ...]:
+    """The descriptors of keyframes of their bytes."""
+    rows = np.frombuffer(data or b"", _keyframe_row(dimension))
+    return tuple((int(row["place"]), row["vector"].astype(np.float32)) for row in rows)
+
+
+def _keyframe_row(dimension: int) -> np.dtype:
+    return np.dtype([("place", "<u4"), ("vector", "<f4", (dimension,))])

@@ -59,6 +59,8 @@ submaps = sa.Table(
     sa.Column("stored_bytes", INTEGER, nullable=False),
     # What the index and the pose graph need, so that a restart parses no header.
     sa.Column("descriptor", sa.LargeBinary, nullable=False),  # float32 (d,)
+    # Of each keyframe that has one: uint32 place in the header, float32 (d,). NULL for none.
+    sa.Column("keyframe_descriptors", sa.LargeBinary),
     sa.Column("previous_number", INTEGER),
     sa.Column("previous_from_anchor", sa.LargeBinary),  # float64 (4, 4)
     sa.Column("information", sa.LargeBinary),  # float64 (6, 6)
@@ -148,6 +150,9 @@ loops = sa.Table(
     sa.Column("overlap", sa.Float, nullable=False, default=0.0),
     sa.Column("verify_seconds", sa.Float, nullable=False, default=0.0),
     sa.Column("kept", sa.Boolean, nullable=False, default=False),
+    # Places in the headers of the keyframes that look alike.
+    sa.Column("source_keyframe", INTEGER, nullable=False, server_default="0"),
+    sa.Column("target_keyframe", INTEGER, nullable=False, server_default="0"),
     sa.UniqueConstraint("session_id", "source", "target"),
 )
 

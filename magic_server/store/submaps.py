@@ -23,7 +23,9 @@ from magic_server.store.rows import (
     StoredSubmap,
     Vertex,
     pack,
+    pack_keyframes,
     unpack,
+    unpack_keyframes,
 )
 from magic_server.store.schema import agents, removed_submaps, submap_blobs, submaps
 
@@ -217,6 +219,7 @@ def submap_columns(session_id: int, agent_id: int, submap: NewSubmap) -> dict[st
         "gaussian_count": submap.gaussian_count,
         "stored_bytes": sum(blob.length for blob in header.blobs),
         "descriptor": vertex.descriptor.vector.astype("<f4").tobytes(),
+        "keyframe_descriptors": pack_keyframes(vertex.keyframes),
         "previous_number": None if edge is None else edge.previous_index,
         "previous_from_anchor": None if edge is None else pack(edge.previous_from_anchor),
         "information": None if edge is None else pack(edge.information),
@@ -242,6 +245,7 @@ def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
         prior=unpack(row.prior, 4),
         searched=row.searched,
         span_s=(row.first_timestamp_s, row.last_timestamp_s),
+        keyframes=unpack_keyframes(row.keyframe_descriptors, len(vector)),
     )
 
 

@@ -19,6 +19,7 @@ from magicslam.v1 import archive_pb2
 from magic_agent.client import ClientConfig, MagicClient
 from magic_cli.main import run_command
 from magic_core.errors import AlreadyExists, CorruptData, InvalidInput, MagicError, NotFound
+from magic_core.submap import Descriptor
 from magic_core.wire import records
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
@@ -63,11 +64,15 @@ async def source(
                 "room", f"agent_{agent}", model_id=MODEL_ID, dimension=DIMENSION
             )
             for index in range(count):
-                await client.submit_submap(make_submap(agent=agent, index=index, submaps=SUBMAPS))
+                await client.submit_submap(
+                    make_submap(agent=agent, index=index, submaps=SUBMAPS, described=agent == 1)
+                )
         await client.finish_agent("room", "agent_0")
         coordinator = await server.sessions.named("room")
         assert await coordinator.idle(timeout_s=600)
-        loop = records.LoopCandidate(name_of(3), name_of(0), 0.9, "PENDING", "PENDING")
+        loop = records.LoopCandidate(
+            name_of(3), name_of(0), 0.9, "PENDING", "PENDING", source_keyframe=1
+        )
         await server._store.loops.add_candidates(coordinator.session, name_of(3), [loop])
         settled = dataclasses.replace(loop, verdict="REJECTED", reason="LOW_FITNESS", fitness=0.25)
         await server._store.loops.settle(coordinator.session, settled)
@@ -132,6 +137,14 @@ async def test_a_session_comes_back_whole_in_another_server(
         assert info == await source.get_session("room")
         assert await (await target.sessions.named("room")).idle(timeout_s=600)
         await assert_same(source, client)
+        (loop,) = (await client.list_loops("room")).candidates
+        assert (loop.source_keyframe, loop.target_keyframe) == (1, 0)
+        keyframe = make_submap(agent=1, submaps=SUBMAPS, described=True).keyframes[1]
+        assert keyframe.descriptor is not None
+        descriptor = Descriptor(MODEL_ID, keyframe.descriptor)
+        answer = await client.query_loops(descriptor, session="room", max_candidates=1)
+        (found,) = answer.candidates
+        assert (found.target, found.target_keyframe) == (name_of(0, agent=1), 1)
         again = b"".join([piece async for piece in client.export_session("room")])
         assert names_in(again) == names_in(archive)
         with pytest.raises(AlreadyExists, match="delete it before"):
@@ -252,6 +265,14 @@ def _foreign_loop(message: archive_pb2.SessionArchive, files: dict) -> None:
     message.loops[0].target = name_of(99)
 
 
+def _no_such_keyframe(message: archive_pb2.SessionArchive, files: dict) -> None:
+    message.loops[0].target_keyframe = 2
+
+
+def _bent_keyframe(message: archive_pb2.SessionArchive, files: dict) -> None:
+    message.submaps[0].header.keyframes[1].image_descriptor[:] = [1.0, 0.0]
+
+
 def _climbing_session(message: archive_pb2.SessionArchive, files: dict) -> None:
     message.session.name = "sessions/../../etc"
 
@@ -282,6 +303,7 @@ def _empty_map(message: archive_pb2.SessionArchive, files: dict) -> None:
         (_stray, "blobs/"), (_climbing, "no place"), (_missing, "not in the archive"),
         (_bad_blob, "submaps[0]"), (_nan, "snapshot"), (_foreign_loop, "loops[0]"),
         (_climbing_session, "session"), (_dangling, "odometry"), (_foreign_agent, "agents[0]"),
+        (_no_such_keyframe, "target_keyframe"), (_bent_keyframe, "keyframes[1].image_descriptor"),
         (_far_time, "submaps[0]"), (_other_model, "submaps[0]"), (_empty_map, "maps[0]"),
     ],
 )  # fmt: skip

@@ -14,8 +14,8 @@ import sqlalchemy as sa
 
 from magic_core.errors import ConfigError
 from magic_core.wire import names
-from magic_server.places import DescriptorIndex
-from magic_server.store import SessionRow, Store, schema
+from magic_server.places import DescriptorIndex, Hit, Place
+from magic_server.store import SessionRow, Store, descriptors, schema
 from magic_server.store.descriptors import DescriptorTable
 from magic_server.store_config import StoreConfig
 from tests.postgresql import PostgresServer
@@ -78,25 +78,25 @@ async def with_submaps(store: Store, session: str, vectors: np.ndarray) -> Sessi
     return row
 
 
-def named(session: str, vectors: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    return [(names.submap_name(session, "a", i), vector) for i, vector in enumerate(vectors)]
+def named(session: str, vectors: np.ndarray) -> list[Place]:
+    return [Place(names.submap_name(session, "a", i), vector) for i, vector in enumerate(vectors)]
 
 
-def exact(vectors: list[tuple[str, np.ndarray]]) -> DescriptorIndex:
+def exact(places: list[Place]) -> DescriptorIndex:
     index = DescriptorIndex(DIMENSION)
-    for name, vector in vectors:
-        index.add(name, vector)
+    index.load(places)
     return index
 
 
-def agreement(found: list[tuple[str, float]], wanted: list[tuple[str, float]]) -> float:
+def agreement(found: list[Hit], wanted: list[Hit]) -> float:
     """Share of the exact neighbours that were found; similarities must be exact."""
-    similar = dict(wanted)
-    for name, similarity in found:
-        if name in similar:
-            assert abs(similarity - similar[name]) < 1e-5
-    assert [s for _, s in found] == sorted((s for _, s in found), reverse=True)
-    return len(similar.keys() & dict(found).keys()) / len(similar)
+    similar = {hit.name: hit for hit in wanted}
+    for hit in found:
+        if hit.name in similar:
+            assert abs(hit.similarity - similar[hit.name].similarity) < 1e-5
+            assert hit.keyframe == similar[hit.name].keyframe
+    assert [hit.similarity for hit in found] == sorted((h.similarity for h in found), reverse=True)
+    return len(similar.keys() & {hit.name for hit in found}) / len(similar)
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ async def test_neighbours_are_those_of_exact_search_in_each_session(
     shares = []
     for places, index in found.values():
         for query in clustered(40, 9):
-            nearest = await places.nearest(query, 24)
+            nearest = await places.nearest(query[None], 24)
             assert len(nearest) == 24
             shares.append(agreement(nearest, index.query(query, 24)))
     used = postgresql.sql(
@@ -140,19 +140,93 @@ async def test_it_holds_what_is_added_and_forgets_what_is_deleted(store: Store) 
     assert places is not None
     pairs = named("kitchen", vectors)
     await places.load(pairs[:10])
-    await places.add(*pairs[10])
-    await places.add(*pairs[10])
-    assert len(await places.nearest(vectors[0], 100)) == 11
-    assert (await places.nearest(5.0 * vectors[10], 1))[0][0] == pairs[10][0]
+    await places.add(pairs[10])
+    await places.add(pairs[10])
+    assert len(await places.nearest(vectors[:1], 100)) == 11
+    assert (await places.nearest(5.0 * vectors[10:11], 1))[0].name == pairs[10].name
     async with store._database.write(row.id) as connection:
         gone = sa.delete(schema.submaps).where(schema.submaps.c.number < 5)
         await connection.execute(gone)
-    await places.remove({name for name, _ in pairs[:5]})
-    assert len(await places.nearest(vectors[0], 100)) == 6
+    await places.remove({place.name for place in pairs[:5]})
+    assert len(await places.nearest(vectors[:1], 100)) == 6
     again = store.places(row)  # as another server that takes the session
     assert again is not None
     await again.load(pairs[5:])
-    assert len(await again.nearest(vectors[0], 100)) == 15
+    assert len(await again.nearest(vectors[:1], 100)) == 15
+
+
+async def test_a_submap_is_found_once_by_the_best_of_its_views(store: Store) -> None:
+    vectors = clustered(120, 4).reshape(40, 3, DIMENSION)
+    near = vectors[0, 0] + 0.01 * clustered(3, 5)  # all nearer than any other
+    vectors[7] = near / np.linalg.norm(near, axis=1, keepdims=True)
+    row = await with_submaps(store, "kitchen", vectors[:, 0])
+    places = [
+        Place(place.name, own[0], [(2, own[1]), (5, own[2])])
+        for place, own in zip(named("kitchen", vectors[:, 0]), vectors, strict=True)
+    ]
+    index = store.places(row)
+    assert index is not None
+    await index.load([Place(place.name, place.vector) for place in places[:30]])
+    await index.load(places[:30])  # what lacks its keyframes gets them
+    for place in places[30:]:
+        await index.add(place)
+    for queries in (vectors[0, :1], vectors[7, 1:], clustered(3, 8)):
+        for count in (1, 12, 40, 100):
+            found = await index.nearest(queries, count)
+            wanted = exact(places).query(queries, count)
+            assert len(found) == len(wanted) == min(count, 40)
+            assert agreement(found, wanted) == 1.0
+            assert [h.query for h in found[:1]] == [h.query for h in wanted[:1]]
+
+
+async def test_many_views_of_one_submap_hide_no_other(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descriptors, "LEAST_CANDIDATES", 8)
+    vectors = clustered(60, 6)
+    row = await with_submaps(store, "kitchen", vectors[:12])
+    places = named("kitchen", vectors[:12])
+    crowd = [(k, vectors[0] + 0.001 * vector) for k, vector in enumerate(vectors[12:], 1)]
+    places[0] = Place(places[0].name, vectors[0], crowd)
+    index = store.places(row)
+    assert index is not None
+    await index.load(places)
+    found = await index.nearest(vectors[:1], 4)
+    assert agreement(found, exact(places).query(vectors[:1], 4)) == 1.0
+
+
+async def test_a_table_of_the_build_before_takes_keyframes_after_its_revision(
+    store: Store, address: str, tmp_path: Path
+) -> None:
+    vectors = clustered(6, 7)
+    row = await with_submaps(store, "kitchen", vectors)
+    index = store.places(row)
+    assert index is not None
+    await index.load(named("kitchen", vectors))
+    async with store._database.write() as connection:
+        for statement in (
+            f"ALTER TABLE descriptors_{DIMENSION} DROP COLUMN keyframe",
+            f"ALTER TABLE descriptors_{DIMENSION} ADD PRIMARY KEY (submap_id)",
+            "ALTER TABLE submaps DROP COLUMN keyframe_descriptors",
+            "UPDATE alembic_version SET version_num = '0003'",
+        ):
+            await connection.execute(sa.text(statement))
+    await store.close()
+    config = StoreConfig(database=address, index="pgvector")
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads, config=config, replica="one") as again:
+            assert again.leases is not None
+            again.leases.begin(address="here:1", lease_s=600.0)
+            await again.leases.take(row)
+            index = again.places(row)
+            assert index is not None
+            places = [
+                Place(place.name, place.vector, [(1, -np.asarray(place.vector))])
+                for place in named("kitchen", vectors)
+            ]
+            await index.load(places)
+            found = await index.nearest(-vectors[2:3], 1)
+            assert [(hit.name, hit.keyframe) for hit in found] == [(places[2].name, 1)]
 
 
 async def test_sessions_prepare_their_table_at_the_same_time(store: Store) -> None:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 
@@ -335,6 +336,72 @@ async def test_an_older_database_gets_the_tables_that_are_missing(
                 assert await connection.run_sync(differences) == []
                 assert await connection.scalar(sa.select(schema.sessions.c.name)) == "old"
         await pool.dispose()
+
+
+def revision_3(connection: sa.Connection) -> None:
+    """The tables as the build before keyframes had descriptors left them, with a loop."""
+    schema.metadata.create_all(connection)
+    for table, column in KEYFRAME_COLUMNS:
+        connection.execute(sa.text(f"ALTER TABLE {table} DROP COLUMN {column}"))
+    connection.execute(sa.text("CREATE TABLE alembic_version (version_num VARCHAR(32))"))
+    connection.execute(sa.text("INSERT INTO alembic_version VALUES ('0003')"))
+    connection.execute(sa.insert(schema.schema_version), {"version": 1})
+    row = {"name": "old", "created_at": 1.0, "model_id": MODEL_ID, "dimension": DIMENSION}
+    connection.execute(sa.insert(schema.sessions), row)
+    connection.execute(sa.text(OLD_LOOP))
+
+
+KEYFRAME_COLUMNS = (
+    ("submaps", "keyframe_descriptors"),
+    ("loops", "source_keyframe"),
+    ("loops", "target_keyframe"),
+)
+OLD_LOOP = (
+    "INSERT INTO loops (session_id, source, target, similarity, verdict, reason, fitness, rmse_m, "
+    "inliers, overlap, verify_seconds, kept) VALUES "
+    "(1, 'a', 'b', 0.5, 'REJECTED', 'LOW_FITNESS', 0, 0, 0, 0, 0, false)"
+)
+
+
+async def test_a_database_from_before_keyframes_had_descriptors_gets_room_for_them(
+    postgresql: PostgresServer, tmp_path: Path
+) -> None:
+    from sqlalchemy.ext.asyncio import create_async_engine
+
+    for address in (postgresql.database(), f"sqlite+aiosqlite:///{tmp_path}/magic.sqlite"):
+        pool = create_async_engine(address)
+        async with pool.begin() as connection:
+            await connection.run_sync(revision_3)
+        async with pool.begin() as connection:
+            await migrations.upgrade(connection, "here")
+            assert await connection.run_sync(differences) == []
+            await connection.execute(sa.text(OLD_LOOP.replace("'a', 'b'", "'c', 'd'")))
+            found = await connection.execute(sa.select(schema.loops))
+            assert [(r.source_keyframe, r.target_keyframe) for r in found] == [(0, 0)] * 2
+        await pool.dispose()
+
+
+async def test_a_folder_from_before_keyframes_had_descriptors_opens_and_takes_them(
+    tmp_path: Path,
+) -> None:
+    with ThreadPoolExecutor(2) as threads:
+        async with Store(tmp_path, threads) as store:
+            await registered(store)
+            await add(store, make_submap(index=0))
+        with closing(sqlite3.connect(tmp_path / "magic.sqlite")) as database:
+            for table, column in KEYFRAME_COLUMNS:
+                database.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
+            database.execute("UPDATE alembic_version SET version_num = '0003'")
+            database.commit()
+        described = make_submap(index=1, keyframes=3, described=True)
+        async with Store(tmp_path, threads) as store:
+            await add(store, described)
+        async with Store(tmp_path, threads) as store:
+            old, new = await store.submaps.vertices(await store.agents.session("room"))
+    assert old.keyframes == ()
+    assert [place for place, _ in new.keyframes] == [1, 2]
+    for (_, vector), keyframe in zip(new.keyframes, described.keyframes[1:], strict=True):
+        np.testing.assert_array_equal(vector, keyframe.descriptor)
 
 
 async def test_a_new_database_has_every_table_and_a_later_one_is_refused(tmp_path: Path) -> None:

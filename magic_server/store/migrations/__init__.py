@@ -15,7 +15,7 @@ from magic_server.store import schema
 
 logger = logging.getLogger(__name__)
 
-HEAD = "0003"
+HEAD = "0004"
 """The revision of this build."""
 FIRST = "0001"
 """What databases from before the revisions are at."""
