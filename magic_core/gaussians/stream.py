@@ -17,7 +17,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from magic_core.gaussians import codec, ply
+from magic_core.gaussians import codec, compact, ply
 from magic_core.gaussians.cloud import GaussianCloud
 
 Pieces = Callable[[], Iterator[GaussianCloud]]
@@ -66,13 +66,13 @@ def write_compact_pieces(
     """Write the compact layout of all pieces in order, each sorted by Morton code in itself."""
     extent = _extent(pieces)
     span = float((extent.high - extent.low).max()) if extent.count else 0.0
-    grid = codec.Grid(extent.low, max(options.position_step_m, span / codec.MAX_GRID))
+    grid = compact.Grid(extent.low, max(options.position_step_m, span / compact.MAX_GRID))
     n, start = extent.count, 0
-    last = np.zeros((1, 3), np.int64)
+    last = compact.Last()
     with tempfile.TemporaryFile(dir=path.parent) as columns:
-        _put(columns, 0, codec.pack_ranges(grid, extent.log_scale, extent.colour))
+        _put(columns, 0, compact.pack_ranges(grid, extent.log_scale, extent.colour))
         for piece in pieces():
-            codes = codec.compact_codes(piece, grid, extent.log_scale, extent.colour, after=last)
+            codes = compact.codes_of(piece, grid, extent.log_scale, extent.colour, after=last)
             for number, column in enumerate(codes.columns):
                 _put(columns, codec.RANGES_BYTES + number * n + start, column)
             last = codes.last

@@ -6,8 +6,9 @@ import random
 
 import numpy as np
 import pytest
+import zstandard
 
-from magic_core.errors import MagicError, ResourceExhausted
+from magic_core.errors import CorruptData, MagicError, ResourceExhausted
 from magic_core.gaussians import GaussianCloud, codec
 from tests.faults.mutations import mutated_frame
 from tests.small_world import make_submap
@@ -42,6 +43,18 @@ def test_it_agrees_with_decoding_on_damaged_blobs() -> None:
         assert verdict(codec.check, data) == expected
         refused += expected[0] is not int
     assert 300 < refused < 1400
+
+
+@pytest.mark.parametrize(("column", "code"), [(12, 4), (13, 128), (15, 255)])
+def test_a_rotation_that_no_code_means_is_refused_by_both(column: int, code: int) -> None:
+    right = codec.encode_compact(make_submap().gaussians)
+    n = codec.gaussian_count(right)
+    content = bytearray(zstandard.ZstdDecompressor().decompress(right[codec.HEADER_BYTES :]))
+    content[codec.RANGES_BYTES + column * n + n // 2] = code
+    damaged = right[: codec.HEADER_BYTES] + zstandard.ZstdCompressor().compress(bytes(content))
+    for function in (codec.decode, codec.check):
+        with pytest.raises(CorruptData, match="rotation"):
+            function(damaged)
 
 
 def test_it_bounds_the_number() -> None:

@@ -59,7 +59,7 @@ def test_compact_errors_stay_within_the_stated_bounds(step_m: float) -> None:
     assert np.abs(decoded.opacities - original.opacities).max() <= 1 / 512 + 1e-6
     assert np.abs(decoded.colours - original.colours).max() <= 1 / 510 + 1e-6
     cosine = np.abs((decoded.quaternions * original.quaternions).sum(axis=1))
-    assert np.degrees(2 * np.arccos(np.minimum(cosine, 1.0))).max() <= 0.25
+    assert np.degrees(2 * np.arccos(np.minimum(cosine, 1.0))).max() <= 2.3
 
 
 def test_compact_is_less_than_a_third_of_lossless() -> None:
@@ -110,7 +110,7 @@ def test_a_count_beyond_the_limit_is_refused_before_anything_is_decompressed() -
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_frame_that_expands_beyond_its_count_is_refused_unread(count: int) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(200 << 20))
-    for layout in (codec.LOSSLESS, codec.COMPACT):
+    for layout in (codec.LOSSLESS, codec.PACKED, codec.COMPACT):
         data = struct.pack("<4sBBHI", codec.MAGIC, codec.VERSION, layout, 0, count) + bomb
         with pytest.raises(CorruptData):
             codec.decode(data)
