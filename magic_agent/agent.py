@@ -26,6 +26,7 @@ from magic_agent.frame_report import FrameReport
 from magic_agent.odometry import Opening
 from magic_agent.pace import Pace
 from magic_agent.places import DescriptorModel
+from magic_agent.places.keyframes import with_described_keyframes
 from magic_agent.restart import Restart, find_restart
 from magic_agent.resume import ResumePoint, ResumeState
 from magic_agent.slam import FrameResult, LocalSlam
@@ -131,6 +132,11 @@ class Agent:
             executor=self._io_threads,
             on_spooled=lambda _, sizes: self.tally.wire_bytes.append(sizes),
             on_receipt=self._on_receipt,
+            completed=partial(
+                with_described_keyframes,
+                describe=self._model.describe,
+                count=self._config.places_keyframes,
+            ),
         )
         async with asyncio.TaskGroup() as group:
             group.create_task(self._read_frames(restart.next_frame))

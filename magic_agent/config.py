@@ -11,6 +11,9 @@ import tyro
 from magic_agent.slam_config import SlamConfig
 from magic_core.errors import ConfigError
 
+MOST_DESCRIBED = 32
+"""Described keyframes of a sub-map; what a server takes unless it is set otherwise."""
+
 
 @dataclass(frozen=True, slots=True)
 class UplinkConfig:
@@ -33,6 +36,9 @@ class AgentConfig(SlamConfig):
     places_model: str = "efficientnet_lite0"
     """Image encoder for place recognition: a name, or the path of an ONNX file. All agents of a
     session use the same."""
+    places_keyframes: int = 0
+    """So many keyframes of a sub-map are described beside its anchor, at most: those that show
+    something else. Places are then found by these views too; 0 describes anchors alone."""
     known_start: bool = False
     """Start from the first ground-truth pose of the data (the paper's setting) instead of an
     unknown pose."""
@@ -49,5 +55,9 @@ class AgentConfig(SlamConfig):
             raise ConfigError.field("rate_hz", f"{self.rate_hz}: expected 0 or more frames per s")
         if self.queue_frames < 1:
             raise ConfigError.field("queue_frames", f"{self.queue_frames}: expected at least 1")
+        if not 0 <= self.places_keyframes <= MOST_DESCRIBED:
+            raise ConfigError.field(
+                "places_keyframes", f"{self.places_keyframes}: expected 0 to {MOST_DESCRIBED}"
+            )
         self.submap.validate()
         self.mapping.resolved()

@@ -80,9 +80,11 @@ def anchor_overlap(
     *,
     camera: Camera,
     anchor_from_camera: Pose,
+    thin: int = _THIN,
 ) -> float:
-    """Share of a frame's depth readings (h, w) whose surface the anchor's depth image shows too."""
-    points = camera.back_project(depth)[::_THIN, ::_THIN][depth[::_THIN, ::_THIN] > 0.0]
+    """Share of a frame's depth readings (h, w) whose surface the anchor's depth image shows too;
+    every `thin`th pixel is looked at, each way."""
+    points = camera.back_project(depth)[::thin, ::thin][depth[::thin, ::thin] > 0.0]
     if not len(points):
         return 1.0  # nothing is known, so nothing is known to have left the view
     seen = se3.transform_points(anchor_from_camera, points)

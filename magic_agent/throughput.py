@@ -20,6 +20,7 @@ import numpy as np
 
 from magic_agent.config import AgentConfig
 from magic_agent.places import DescriptorModel, load_descriptor_model
+from magic_agent.places.keyframes import with_described_keyframes
 from magic_agent.slam import FrameResult, LocalSlam
 from magic_agent.tally import peak_rss_bytes
 from magic_core.data import Frame, FrameSource, open_dataset
@@ -138,7 +139,7 @@ def confined(threads: int) -> Iterator[int | None]:
 
 
 def _set_cores(cores: set[int]) -> None:
-    """For every thread of this process: libraries have started some already, and some end meanwhile."""
+    """For every thread of this process: libraries have started some already; some end meanwhile."""
     for task in Path("/proc/self/task").iterdir():
         with suppress(ProcessLookupError):
             os.sched_setaffinity(int(task.name), cores)
@@ -155,7 +156,7 @@ def measure(source: FrameSource, config: AgentConfig, model: DescriptorModel) ->
 
         def close(submap: Submap | None) -> None:
             if submap is not None:
-                encoded.append(encoding.submit(_encode, submap))
+                encoded.append(encoding.submit(_encode, submap, model, config.places_keyframes))
                 speed.submap_ends_s.append(time.perf_counter() - started)
                 speed.submap_frames.append(len(submap.trajectory))
 
@@ -193,9 +194,10 @@ def _read_ahead(
             yield coming.popleft().result(), time.perf_counter() - began
 
 
-def _encode(submap: Submap) -> float:
-    """Both encodings, as the uplink makes them; returns the seconds."""
+def _encode(submap: Submap, model: DescriptorModel, keyframes: int) -> float:
+    """Keyframes described and both encodings made, as the uplink does it; returns the seconds."""
     began = time.perf_counter()
+    submap = with_described_keyframes(submap, model.describe, count=keyframes)
     encode_submap(submap, request_id=submap.name)
     encode_submap(submap, request_id=submap.name, encoding=SubmapEncoding.lossless())
     return time.perf_counter() - began
@@ -214,4 +216,4 @@ def _warm(source: FrameSource, config: AgentConfig, model: DescriptorModel) -> N
         slam.process(source[number])
     last = slam.finish()
     if last is not None:
-        _encode(last)
+        _encode(last, model, config.places_keyframes)

@@ -51,13 +51,17 @@ class Uplink:
         executor: Executor,
         on_spooled: Callable[[int, WireBytes], None],
         on_receipt: Callable[[int, SubmapReceipt], None],
+        completed: Callable[[Submap], Submap] = lambda submap: submap,
     ) -> None:
+        """`completed` is called on the executor before a sub-map is encoded: what may be added to
+        it then does not hold up tracking."""
         self._client = client
         self._spool = spool
         self._config = config
         self._executor = executor
         self._on_spooled = on_spooled
         self._on_receipt = on_receipt
+        self._completed = completed
         self._finished: asyncio.Queue[Finished | None] = asyncio.Queue(QUEUE_SUBMAPS)
         # What an earlier process left may be on the server in part.
         self._left_over = frozenset(spool.pending())
@@ -90,7 +94,7 @@ class Uplink:
 
     def _encode_and_store(self, finished: Finished) -> WireBytes:
         """Both encodings are made, so that every report can say what the codec saves."""
-        submap = finished.submap
+        submap = self._completed(finished.submap)
         request_id = f"{submap.agent}-{submap.index}-{uuid.uuid4().hex}"
         compact = encode_submap(submap, request_id=request_id)
         lossless = encode_submap(submap, request_id=request_id, encoding=SubmapEncoding.lossless())

@@ -4,6 +4,9 @@ Takes every n-th frame of each agent as an anchor, registers every pair with eac
 compares with the overlap that the true poses give. Several datasets at once also test every pair
 across them, which must all be refused.
 
+With --described, instead: which loops are found by descriptors of anchors alone and which by those
+of keyframes too (--places-keyframes of an agent), and what the candidates come to.
+
 Example: magic bench loops ../shared/data/redkitchen ../shared/data/living_room_3agents --every 50
 """
 
@@ -11,11 +14,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 from tyro.conf import Positional
 
 from magic_cli.options import parse
 from magic_cli.output import console, print_json, table
+
+if TYPE_CHECKING:
+    from magic_server.registration import AnchorView
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +43,9 @@ class LoopsBenchmark:
     """Coarse registration methods, `+` joins those that are tried together."""
     models: tuple[str, ...] = ("efficientnet_lite0",)
     """Image encoders: names, or paths of ONNX files."""
+    described: tuple[int, ...] = ()
+    """Compare these numbers of described keyframes per sub-map, at the encoder's own threshold and
+    with the first of `methods`; 0 is anchors alone."""
     json: bool = False
     """Print one JSON object as the last line."""
 
@@ -42,6 +53,10 @@ class LoopsBenchmark:
 def main(arguments: list[str]) -> int:
     """Run the benchmark and print its tables."""
     config = parse(LoopsBenchmark, arguments, prog="magic bench loops", description=__doc__ or "")
+    return _compare_described(config) if config.described else _register_all(config)
+
+
+def _register_all(config: LoopsBenchmark) -> int:
     from magic_agent.places import load_descriptor_model
     from magic_server.registration.benchmark import run
 
@@ -60,6 +75,65 @@ def main(arguments: list[str]) -> int:
     if config.json:
         print_json(result)
     return 0
+
+
+def _compare_described(config: LoopsBenchmark) -> int:
+    from magic_agent.places import load_descriptor_model
+    from magic_server.loops import LoopConfig
+    from magic_server.registration.config import RegistrationConfig
+    from magic_server.registration.described_benchmark import run
+
+    found = {}
+    methods = tuple(config.methods[0].split("+"))
+    with console.status("registering pairs") as status:
+        for name in config.models:
+            model = load_descriptor_model(name)
+            found[name] = run(
+                config.datasets,
+                describe=model.describe,
+                choose=_chosen,
+                counts=config.described,
+                min_similarity=LoopConfig().threshold(model.model_id),
+                every=config.every,
+                scale=config.scale,
+                keyframes=config.keyframes,
+                config=RegistrationConfig(methods=methods),  # type: ignore[arg-type]
+                progress=lambda share, text: status.update(f"{text}: {share:.0%} of the pairs"),
+            )
+    for name, result in found.items():
+        console.print(_described(name, result))
+    if config.json:
+        print_json(found)
+    return 0
+
+
+def _chosen(view: AnchorView, count: int) -> list[int]:
+    """The keyframes that an agent would describe."""
+    from magic_agent.places.keyframes import spread_keyframes
+    from magic_core.submap import Keyframe
+
+    images = [(np.eye(4), view.colour, view.depth), *view.keyframes]
+    keyframes = [Keyframe(place, float(place), *image) for place, image in enumerate(images)]
+    return spread_keyframes(keyframes, view.camera, count)
+
+
+def _described(name: str, result: dict):
+    bins = list(result["described"][0]["by_overlap"])
+    columns = ["described", "per sub-map", "candidates", *(f"found, right of {b}" for b in bins),
+               "accepted", "wrong", "time"]  # fmt: skip
+    rows = []
+    for row in result["described"]:
+        shares = [row["by_overlap"][b] for b in bins]
+        rows.append([
+            str(row["described"]), f"{row['descriptors_per_submap']:.2f}", str(row["candidates"]),
+            *(f"{s['detected']} / {s['right']} of {s['pairs']}" for s in shares),
+            str(row["accepted"]), str(row["wrong"]), f"{row['seconds']:.0f} s",
+        ])  # fmt: skip
+    title = (
+        f"{name} from {result['min_similarity']:.3f}: {result['submaps']} sub-maps, "
+        f"{result['pairs']} pairs, {result['loops']} overlapping"
+    )
+    return table(title, columns, rows)
 
 
 def _verification(result: dict):
