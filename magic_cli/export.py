@@ -10,9 +10,14 @@
 `--axes` says what x, y and z of the file point to: (r)ight or (l)eft, (u)p or (d)own, (f)orward or
 (b)ack, of the first camera. Ours are rdf; ROS has flu, Unity ruf, glTF and SPZ want rub.
 
+`--region` (of the map and its points) takes what lies in a box, lowest x y z and highest x y z in
+metres, in our axes whatever those of the file. `--max-gaussians` merges neighbours that are alike
+until so many are left, so that the picture stays whole.
+
 Examples:
   magic export runs/demo --what mesh --out scene.glb
   magic export runs/demo --what map --out scene.ply --axes rub
+  magic export runs/demo --out corner.ply --region 0 -2 0 3 1 4 --max-gaussians 50000
   magic export runs/demo --what trajectories --format kitti --out kitti/
   magic export runs/demo --what rerun --out demo.rrd
 """
@@ -44,6 +49,7 @@ FORMATS = {
 }
 _OF_SUFFIX = {".glb": "glb", ".spz": "spz"}
 _SPECIFIED_AXES = {"glb": "rub", "spz": "rub"}
+_IN_PART = ("map", "points")
 _RERUN_POINTS = 1_000_000
 _DIRECTION = {"r": "right", "l": "left", "u": "up", "d": "down", "f": "forward", "b": "back"}
 
@@ -77,6 +83,11 @@ class ExportConfig:
     axes: str | None = None
     """Axes of the file, such as rdf, rub, flu or ruf; default rdf, but rub for glb and spz, whose
     specifications say so."""
+    region: tuple[float, float, float, float, float, float] | None = None
+    """Map and points: only what lies in this box, lowest x y z and highest x y z in metres, in the
+    axes of the map (rdf)."""
+    max_gaussians: int = 0
+    """Map and points: at most so many; neighbours that are alike are merged. 0: all."""
     kind: Literal["tracked", "corrected", "ground_truth"] = "corrected"
     """Which trajectories: odometry alone, after the pose graph, or the data's own."""
     mesh: MeshConfig = field(default_factory=MeshConfig)
@@ -89,6 +100,7 @@ def main(arguments: list[str]) -> int:
     """Write the chosen files and list them."""
     config = parse(ExportConfig, arguments, prog="magic export", description=__doc__ or "")
     chosen = _chosen_format(config)
+    _check_part(config)
     axes = (config.axes or _SPECIFIED_AXES.get(chosen, OURS)).lower()
     matrix = axes_from_ours(axes)
     folder = RunFolder(config.run)
@@ -127,8 +139,17 @@ def _chosen_format(config: ExportConfig) -> str:
     return chosen
 
 
+def _check_part(config: ExportConfig) -> None:
+    if config.max_gaussians < 0:
+        raise ConfigError(f"--max-gaussians {config.max_gaussians}: expected 0 or more")
+    if config.what not in _IN_PART and (config.region or config.max_gaussians):
+        raise ConfigError(
+            f"--region and --max-gaussians are for {' and '.join(_IN_PART)}, not {config.what}"
+        )
+
+
 def _map(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
-    cloud = _oriented_map(folder, matrix)
+    cloud = _oriented_map(folder, config, matrix)
     if chosen == "ply":
         from magic_core.gaussians.ply import write_ply
 
@@ -145,15 +166,26 @@ def _map(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarra
     return [config.out]
 
 
-def _oriented_map(folder: RunFolder, matrix: np.ndarray) -> GaussianCloud:
+def _oriented_map(folder: RunFolder, config: ExportConfig, matrix: np.ndarray) -> GaussianCloud:
+    """What is wanted of the map, in the file's axes."""
+    from magic_core.gaussians.reduction import reduced
+    from magic_core.gaussians.region import Region
+
     cloud = folder.read_map()
+    if config.region is not None:
+        x, y, z, *high = config.region
+        cloud = cloud.select(Region((x, y, z), (high[0], high[1], high[2])).holds(cloud.means))
+        if not len(cloud):
+            raise NotFound(f"--region {' '.join(map(str, config.region))}: no Gaussian lies in it")
+    if config.max_gaussians:
+        cloud = reduced(cloud, config.max_gaussians)
     return cloud if np.array_equal(matrix, np.eye(3)) else cloud.reoriented(matrix)
 
 
 def _points(folder: RunFolder, config: ExportConfig, chosen: str, matrix: np.ndarray) -> list[Path]:
     from magic_core.gaussians.points import write_points
 
-    cloud = _oriented_map(folder, matrix)
+    cloud = _oriented_map(folder, config, matrix)
     comment = f"axes {named_axes(config.axes or OURS)} of the first camera"
     return [write_points(config.out, cloud.select(cloud.opacities >= 0.5), comment=comment)]
 

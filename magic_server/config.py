@@ -12,6 +12,7 @@ from magic_core.wire import SubmapLimits, Transport
 from magic_server.access import AccessConfig
 from magic_server.audit import AuditConfig
 from magic_server.cluster_config import ClusterConfig
+from magic_server.excerpt_config import ExcerptConfig
 from magic_server.globalmap import MergeConfig
 from magic_server.health_port import HealthPortConfig
 from magic_server.jobs import JobConfig
@@ -105,6 +106,7 @@ class ServerConfig:
     posegraph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     preview: PreviewConfig = field(default_factory=PreviewConfig)
+    excerpts: ExcerptConfig = field(default_factory=ExcerptConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
     def __post_init__(self) -> None:

@@ -12,7 +12,6 @@ import contextlib
 import logging
 import shutil
 import time
-import zlib
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -21,15 +20,17 @@ from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import submap_pb2
 
 from magic_core.errors import NotFound, WrongState
-from magic_core.wire import MAX_CHUNK_BYTES, geometry, names, records
+from magic_core.wire import geometry, names, records
 from magic_core.wire.convert import moment
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
-from magic_server.jobs.delivery import Deliveries, Delivery, FolderDelivery, JobFile, OpenFile
+from magic_server.jobs.delivery import Deliveries, Delivery, JobFile, OpenFile
 from magic_server.jobs.tasks import PlacedFiles, PreviewTask, append_submaps
 from magic_server.preview_config import PreviewConfig
+from magic_server.sending import open_chunks
 from magic_server.sessions import Sessions
 from magic_server.store import Store
+from magic_server.store.blob_store import StreamedFile
 from magic_server.tasks import TaskScope
 
 logger = logging.getLogger(__name__)
@@ -96,15 +97,30 @@ class Previews:
 
         Made now where there is none in this format. NotFound while no sub-map is placed.
         """
+        last = await self._newest(session, kind)
+        made, sha256, length = last.files[kind]
+        file = await self._in_thread(self._deliveries.opened, made)
+        return last.info, sha256, length, self._chunks(last, file)
+
+    @contextlib.asynccontextmanager
+    async def held(self, session: str) -> AsyncIterator[tuple[records.GlobalMapInfo, StreamedFile]]:
+        """The last preview of a session and its lossless file, which stays there for the block.
+
+        Made now where there is none. NotFound while no sub-map is placed.
+        """
+        last = await self._newest(session, "lossless")
+        made, sha256, _ = last.files["lossless"]
+        async with self._reading(last):
+            yield last.info, self._deliveries.streamed(made, sha256)
+
+    async def _newest(self, session: str, kind: records.MapFormat) -> _Preview:
         row = await self._store.agents.session(session)
         coordinator = await self._sessions.coordinator(row)
         await self._forget_deleted(coordinator)
         last = self._last.get(row.id)
         if last is None or kind not in last.files:
             last = await self._made(coordinator, kind)
-        made, sha256, length = last.files[kind]
-        file = await self._in_thread(self._deliveries.opened, made)
-        return last.info, sha256, length, self._chunks(last, file)
+        return last
 
     async def _follow(self) -> None:
         """Build anew whatever session's pose graph has changed, one after another."""
@@ -205,30 +221,29 @@ class Previews:
     async def _replace(self, preview: _Preview) -> None:
         """Remove what nobody will ask for again, once nobody reads it."""
         preview.replaced = True
-        if isinstance(preview.delivery, FolderDelivery) or not preview.readers:
-            # An open file stays readable; an object does not.
+        if not preview.readers:
             await self._in_thread(preview.delivery.clear)
+
+    @contextlib.asynccontextmanager
+    async def _reading(self, preview: _Preview) -> AsyncIterator[None]:
+        """Keep a preview's files for a block."""
+        preview.readers += 1
+        try:
+            yield
+        finally:
+            preview.readers -= 1
+            if preview.replaced and not preview.readers:
+                await asyncio.shield(self._in_thread(preview.delivery.clear))
 
     async def _chunks(
         self, preview: _Preview, file: OpenFile
     ) -> AsyncIterator[submap_pb2.BlobChunk]:
-        def piece(offset: int) -> submap_pb2.BlobChunk | None:
-            data = file.read(MAX_CHUNK_BYTES)
-            if not data:
-                return None
-            return submap_pb2.BlobChunk(offset=offset, data=data, crc32=zlib.crc32(data))
-
-        preview.readers += 1
         try:
-            offset = 0
-            while (chunk := await self._in_thread(piece, offset)) is not None:
-                yield chunk
-                offset += len(chunk.data)
+            async with self._reading(preview):
+                async for chunk in open_chunks(file, self._threads):
+                    yield chunk
         finally:
             file.close()
-            preview.readers -= 1
-            if preview.replaced and not preview.readers:
-                await asyncio.shield(self._in_thread(preview.delivery.clear))
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

@@ -7,6 +7,7 @@ import time
 
 from magic_core.errors import NotFound, WrongState
 from magic_core.wire import names
+from magic_server.excerpts import Excerpts
 from magic_server.globalmaps import GlobalMaps
 from magic_server.sessions import Sessions
 from magic_server.store import AgentRow, Deleted, DeletionRequest, SessionRow, Store
@@ -15,10 +16,13 @@ from magic_server.store import AgentRow, Deleted, DeletionRequest, SessionRow, S
 class Removal:
     """Deletes sub-maps, agents and sessions, each at most once for one request id."""
 
-    def __init__(self, store: Store, sessions: Sessions, maps: GlobalMaps) -> None:
+    def __init__(
+        self, store: Store, sessions: Sessions, maps: GlobalMaps, excerpts: Excerpts
+    ) -> None:
         self._store = store
         self._sessions = sessions
         self._maps = maps
+        self._excerpts = excerpts
 
     async def submap(self, name: str, *, request_id: str, force: bool) -> Deleted:
         """Delete a sub-map by its resource name."""
@@ -30,10 +34,12 @@ class Removal:
         _require_finished(agent, name, force=force)
         coordinator = await self._sessions.coordinator(agent.session)
         request = DeletionRequest(name, request_id, time.time())
-        return await coordinator.remove(
+        deleted = await coordinator.remove(
             lambda: {name},
             lambda solution: self._store.deletions.submap(agent, index, request, solution),
         )
+        await self._excerpts.forget(agent.session.id)
+        return deleted
 
     async def agent(self, name: str, *, request_id: str, force: bool) -> Deleted:
         """Delete an agent and its sub-maps by its resource name."""
@@ -50,6 +56,7 @@ class Removal:
             agent=name,
         )
         await asyncio.to_thread(self._store.uploads.forget, f"{name}/")
+        await self._excerpts.forget(agent.session.id)
         return deleted
 
     async def session(self, name: str, *, request_id: str, force: bool) -> Deleted:
@@ -64,6 +71,7 @@ class Removal:
         async with self._sessions.forgotten(session, NotFound(f"{name} was deleted")):
             await self._maps.forget(session)
             deleted = await self._store.deletions.session(session, request)
+        await self._excerpts.forget(session.id)
         await asyncio.to_thread(self._store.uploads.forget, f"{name}/")
         return deleted
 

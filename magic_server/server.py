@@ -32,6 +32,7 @@ from magic_server.blob_watch import BlobWatch
 from magic_server.calls import CallDesk
 from magic_server.config import LOOPBACK, ServerConfig
 from magic_server.drain import Gate
+from magic_server.excerpts import Excerpts
 from magic_server.globalmaps import GlobalMaps
 from magic_server.health_port import HealthPort
 from magic_server.interceptors import CallInterceptor
@@ -122,6 +123,12 @@ class Server:
             threads=self._store.blob_threads,
             config=config.preview,
         )
+        self._excerpts = Excerpts(
+            self._store,
+            jobs=self._jobs,
+            threads=self._store.blob_threads,
+            config=config.excerpts,
+        )
         self.localizer = Localizer(self._store, **shared)
         self._health = health.aio.HealthServicer()  # pyright: ignore[reportAttributeAccessIssue]
         self._grpc: grpc.aio.Server | None = None
@@ -200,6 +207,7 @@ class Server:
                 await self._leasing.start(self._public_address())
             self._upkeep.start()
             await self._previews.start()
+            await self._excerpts.start()
             self._watch.start()
             self.gate.open()
             await self._set_ready(True)
@@ -235,6 +243,7 @@ class Server:
         await self._receiver.close()
         await self._maps.close()
         await self._previews.close()
+        await self._excerpts.close()
         await self.sessions.close()
         await self._jobs.close()
         if self._leasing is not None:
@@ -327,12 +336,12 @@ class Server:
             config=self.config,
         )
         mapping_grpc.add_MappingServiceServicer_to_server(mapping, server)
-        maps = GlobalMapServicer(self._store, self._maps, self._previews)
+        maps = GlobalMapServicer(self._store, self._maps, self._previews, self._excerpts)
         map_grpc.add_GlobalMapServiceServicer_to_server(maps, server)
         sessions = SessionServicer(
             self._store,
             self.sessions,
-            removal=Removal(self._store, self.sessions, self._maps),
+            removal=Removal(self._store, self.sessions, self._maps, self._excerpts),
             threads=self._threads,
             limits=self.config.limits,
         )

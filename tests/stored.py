@@ -8,7 +8,7 @@ from magic_server.config import ServerConfig
 from magic_server.store.bucket import BucketBlobs, bucket_of, listed
 from magic_server.store.bucket_client import BucketClient
 
-OTHERS = ("database-id", "/previews/", "/merge-")
+OTHERS = ("database-id", "/previews/", "/merge-", "/excerpts/")
 """Objects of a bucket that are no blobs of a session."""
 
 

@@ -12,6 +12,7 @@ from magicslam.v1 import global_map_service_pb2 as map_pb
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import session_service_pb2 as session_pb
 
+from magic_core.gaussians.region import Region
 from magic_core.wire import geometry, records
 
 _K = TypeVar("_K")
@@ -230,6 +231,42 @@ def map_from_proto(message: map_pb.GlobalMap) -> records.GlobalMapInfo:
         submaps=tuple(message.submaps),
         gaussian_count=message.gaussian_count,
         created_at=timestamp_from_proto(message.created_at),
+    )
+
+
+def region_to_proto(region: Region) -> map_pb.Region:
+    """A box as its message."""
+    (low_x, low_y, low_z), (high_x, high_y, high_z) = region.low, region.high
+    return map_pb.Region(
+        low_x=low_x, low_y=low_y, low_z=low_z, high_x=high_x, high_y=high_y, high_z=high_z
+    )
+
+
+def region_from_proto(message: map_pb.Region) -> Region:
+    """The box of a message; InvalidInput for NaN and for one that holds nothing."""
+    return Region(
+        (message.low_x, message.low_y, message.low_z),
+        (message.high_x, message.high_y, message.high_z),
+    )
+
+
+def part_to_proto(part: records.MapPart) -> map_pb.MapPart:
+    """What a file holds of a map, as its message."""
+    return map_pb.MapPart(
+        region=None if part.region is None else region_to_proto(part.region),
+        max_gaussians=part.max_gaussians,
+        gaussian_count=part.gaussian_count,
+        full_gaussian_count=part.full_gaussian_count,
+    )
+
+
+def part_from_proto(message: map_pb.MapPart) -> records.MapPart:
+    """What a file holds of a map."""
+    return records.MapPart(
+        region=region_from_proto(message.region) if message.HasField("region") else None,
+        max_gaussians=message.max_gaussians,
+        gaussian_count=message.gaussian_count,
+        full_gaussian_count=message.full_gaussian_count,
     )
 
 

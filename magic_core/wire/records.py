@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from magic_core.gaussians.region import Region
 
 Verdict = Literal["SIMILAR", "PENDING", "ACCEPTED", "REJECTED"]
 OperationState = Literal["PENDING", "RUNNING", "SUCCEEDED", "FAILED"]
@@ -150,6 +152,20 @@ class TrajectoryPart:
 
 
 @dataclass(frozen=True, slots=True)
+class MapPart:
+    """What a file holds of a map."""
+
+    region: Region | None
+    """As it was asked for; None for the whole map."""
+    max_gaussians: int
+    """As it was asked for; 0 for all."""
+    gaussian_count: int
+    """Gaussians in the file."""
+    full_gaussian_count: int
+    """Gaussians that the map has in the region; where these are more, neighbours were merged."""
+
+
+@dataclass(frozen=True, slots=True)
 class GlobalMapInfo:
     """A merged map of one component."""
 
@@ -160,6 +176,8 @@ class GlobalMapInfo:
     submaps: tuple[str, ...]
     gaussian_count: int
     created_at: datetime
+    part: MapPart | None = field(default=None, compare=False)
+    """What a download holds of it; None where nothing was downloaded."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,9 @@ from typing import Protocol
 
 from magic_core.errors import MagicError, NotFound
 from magic_server.store import Store, WrittenBlob
-from magic_server.store.bucket import Delivered, delete, put_file, whole
+from magic_server.store.blob_store import StreamedFile
+from magic_server.store.blobs import LocalFile
+from magic_server.store.bucket import BucketFile, Delivered, delete, put_file, whole
 from magic_server.store.bucket_client import BucketPlace, client_of
 
 JobFile = Path | Delivered
@@ -168,6 +170,13 @@ class Deliveries:
         """What a job left in the bucket, for the store to adopt."""
         assert self._bucket is not None  # nobody else delivers there
         return self._bucket.delivered(file)
+
+    def streamed(self, file: JobFile, sha256: str) -> StreamedFile:
+        """What a job made, for another job to read."""
+        if isinstance(file, Path):
+            return LocalFile(file, sha256)
+        assert self._bucket is not None
+        return BucketFile(self._bucket.place, file.key, sha256)
 
     def opened(self, file: JobFile) -> OpenFile:
         """What a job made, for reading. Blocks."""

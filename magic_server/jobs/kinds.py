@@ -28,6 +28,7 @@ KINDS = {
     "localize_image": JobKind(40, patient=False),
     "solve_pose_graph": JobKind(30),
     "verify_loop": JobKind(20),
+    "make_excerpt": JobKind(15, patient=False),
     "append_submaps": JobKind(10, patient=False),
     "merge_submaps": JobKind(0, refines=True),
 }

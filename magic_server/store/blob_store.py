@@ -26,6 +26,20 @@ class StoredBlob(Protocol):
         ...
 
 
+class StreamedFile(Protocol):
+    """A large file as jobs read it. It holds names alone: it travels to other processes."""
+
+    @property
+    def sha256(self) -> str:
+        """Digest of its content, in hex."""
+        ...
+
+    def pieces(self) -> Iterator[bytes]:
+        """All of it in order, a piece in memory at a time. NotFound without it, CorruptData at
+        the end when it is not what it was."""
+        ...
+
+
 class WrittenBlob(Protocol):
     """A blob on its way in."""
 
@@ -72,6 +86,10 @@ class BlobStore(Protocol):
 
     def blob(self, sha256: str) -> StoredBlob:
         """A blob for a job to read."""
+        ...
+
+    def streamed(self, sha256: str) -> StreamedFile:
+        """A blob for a job to read in pieces."""
         ...
 
     def writer(self) -> WrittenBlob:

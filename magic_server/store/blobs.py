@@ -43,6 +43,27 @@ class FileBlob:
             return file.read(length)
 
 
+@dataclass(frozen=True, slots=True)
+class LocalFile:
+    """A file that is read in pieces."""
+
+    path: Path
+    sha256: str
+
+    def pieces(self) -> Iterator[bytes]:
+        """All of it in order. NotFound without it, CorruptData when it is not what it was."""
+        digest = hashlib.sha256()
+        try:
+            with self.path.open("rb") as file:
+                while piece := file.read(_READ_BYTES):
+                    digest.update(piece)
+                    yield piece
+        except FileNotFoundError:
+            raise NotFound("what is being read has been deleted") from None
+        if digest.hexdigest() != self.sha256:
+            raise CorruptData(damage(self.path))
+
+
 class BlobFolder:
     """Files named by the SHA-256 of their content."""
 
@@ -72,6 +93,10 @@ class BlobFolder:
     def blob(self, sha256: str) -> FileBlob:
         """A blob for a job to read."""
         return FileBlob(self.path(sha256))
+
+    def streamed(self, sha256: str) -> LocalFile:
+        """A blob for a job to read in pieces."""
+        return LocalFile(self.path(sha256), sha256)
 
     def writer(self) -> BlobWriter:
         """Begin a new blob."""

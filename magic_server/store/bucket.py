@@ -139,6 +139,25 @@ class StagedBlob:
 
 
 @dataclass(frozen=True, slots=True)
+class BucketFile:
+    """An object that is read in pieces."""
+
+    place: BucketPlace
+    key: str
+    sha256: str
+
+    def pieces(self) -> Iterator[bytes]:
+        """All of it in order. NotFound without it, CorruptData when it is not what it was."""
+        client, digest, offset = client_of(self.place), hashlib.sha256(), 0
+        while piece := _read_piece(client, self.key, offset, self.place.part_bytes):
+            digest.update(piece)
+            offset += len(piece)
+            yield piece
+        if digest.hexdigest() != self.sha256:
+            raise CorruptData(_damage(self.place, self.key))
+
+
+@dataclass(frozen=True, slots=True)
 class Delivered:
     """A file that a job left in the bucket."""
 
@@ -222,6 +241,10 @@ class BucketBlobs:
         """A blob for a job to read."""
         return BucketBlob(self.place, sha256)
 
+    def streamed(self, sha256: str) -> BucketFile:
+        """A blob for a job to read in pieces."""
+        return BucketFile(self.place, _key(sha256), sha256)
+
     def writer(self) -> StagedBlob:
         """Begin a new blob."""
         return StagedBlob(self._client, f"{self._incoming}{uuid.uuid4().hex}")
@@ -286,7 +309,7 @@ class BucketBlobs:
 
     def damage(self, sha256: str) -> str:
         """What is wrong with a stored blob that does not match its name, and what helps."""
-        return _damage(self.place, sha256)
+        return _damage(self.place, _key(sha256))
 
     def mark(self, identity: str) -> None:
         """Write down whose blobs these are, where nobody has; WrongState for another's."""
@@ -419,7 +442,7 @@ def _read(client: BucketClient, sha256: str) -> bytes:
         where = client.place.path(_key(sha256))
         raise NotFound(f"the stored blob s3://{where} is missing; restore it") from None
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise CorruptData(_damage(client.place, sha256))
+        raise CorruptData(_damage(client.place, _key(sha256)))
     return data
 
 
@@ -451,8 +474,8 @@ def _delete(client: BucketClient, keys: Sequence[str]) -> None:
     client.run_all("delete", [remove(path(key)) for key in keys])
 
 
-def _damage(place: BucketPlace, sha256: str) -> str:
+def _damage(place: BucketPlace, key: str) -> str:
     return (
-        f"the stored blob s3://{place.path(_key(sha256))} is damaged: its SHA-256 is not its name; "
+        f"the stored blob s3://{place.path(key)} is damaged: its SHA-256 is not its name; "
         "restore it from a backup, or delete the sub-map or map that it belongs to"
     )

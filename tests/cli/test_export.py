@@ -218,3 +218,29 @@ def test_json_says_what_was_written(run, tmp_path, capsys):
     from magic_core.gaussians import codec
 
     assert len(codec.decode((tmp_path / "m.mgsc").read_bytes())) == len(run.read_map())
+
+
+def test_a_part_of_the_map_in_fewer_gaussians(run, tmp_path, capsys):
+    whole = run.read_map()
+    middle = np.median(whole.means, axis=0)
+    low, high = (middle - 1.0).tolist(), (middle + 1.0).tolist()
+    inside = ((whole.means >= low) & (whole.means < high)).all(axis=1)
+    box = [str(value) for value in (*low, *high)]
+    path = export(run, tmp_path / "part.ply", "--region", *box)
+    assert len(PlyData.read(str(path))["vertex"]) == inside.sum() > 10
+    path = export(
+        run, tmp_path / "fewer.ply", "--axes", "rub", "--region", *box, "--max-gaussians", "10"
+    )
+    vertices = PlyData.read(str(path))["vertex"]
+    ours = np.stack([vertices[name] for name in "xyz"], axis=1) @ axes_from_ours("rub")
+    assert len(ours) == 10
+    assert ((ours >= np.array(low) - 1e-5) & (ours < np.array(high) + 1e-5)).all()
+    for wrong, words in (
+        (["--region", *box[3:], *box[:3]], "lowest"),
+        (["--region", *["1e6"] * 3, *["2e6"] * 3], "no Gaussian"),
+        (["--max-gaussians", "-1"], "0 or more"),
+        (["--what", "mesh", "--max-gaussians", "5"], "map and points"),
+    ):
+        assert run_command(["export", str(run.path), "--out", str(tmp_path / "x.ply"), *wrong])
+        assert words in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "x.ply").exists()

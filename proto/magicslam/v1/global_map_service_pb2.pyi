@@ -438,6 +438,50 @@ class ListOperationsResponse(_message.Message):
 Global___ListOperationsResponse: _TypeAlias = ListOperationsResponse  # noqa: Y015
 
 @_typing.final
+class Region(_message.Message):
+    """An axis-aligned box of space. Sides may be infinite; NaN, and a lowest value that is not below the
+    highest, are refused.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    LOW_X_FIELD_NUMBER: _builtins.int
+    LOW_Y_FIELD_NUMBER: _builtins.int
+    LOW_Z_FIELD_NUMBER: _builtins.int
+    HIGH_X_FIELD_NUMBER: _builtins.int
+    HIGH_Y_FIELD_NUMBER: _builtins.int
+    HIGH_Z_FIELD_NUMBER: _builtins.int
+    low_x: _builtins.float
+    """Lowest x, metres; a point there is in the box."""
+    low_y: _builtins.float
+    """Lowest y, metres."""
+    low_z: _builtins.float
+    """Lowest z, metres."""
+    high_x: _builtins.float
+    """Highest x, metres; a point there is not in the box, so that boxes side by side share nothing."""
+    high_y: _builtins.float
+    """Highest y, metres."""
+    high_z: _builtins.float
+    """Highest z, metres."""
+    def __init__(
+        self,
+        *,
+        low_x: _builtins.float = ...,
+        low_y: _builtins.float = ...,
+        low_z: _builtins.float = ...,
+        high_x: _builtins.float = ...,
+        high_y: _builtins.float = ...,
+        high_z: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["high_x", b"high_x", "high_y", b"high_y", "high_z", b"high_z", "low_x", b"low_x", "low_y", b"low_y", "low_z", b"low_z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Region: _TypeAlias = Region  # noqa: Y015
+
+@_typing.final
 class GetGlobalMapRequest(_message.Message):
     """Asks for a map's file."""
 
@@ -445,6 +489,8 @@ class GetGlobalMapRequest(_message.Message):
 
     NAME_FIELD_NUMBER: _builtins.int
     FORMAT_FIELD_NUMBER: _builtins.int
+    REGION_FIELD_NUMBER: _builtins.int
+    MAX_GAUSSIANS_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     """Resource name of a map, or `sessions/{session}` for the session's newest, or
     `sessions/{session}/maps/preview` for the preview: the sub-maps appended as they were sent, where
@@ -452,15 +498,25 @@ class GetGlobalMapRequest(_message.Message):
     """
     format: Global___MapFormat.ValueType
     """The file format."""
+    max_gaussians: _builtins.int
+    """Level of detail: most Gaussians in the file, 0 for all. Where there are more, neighbours that are
+    alike are merged until so many are left, so that the picture stays whole.
+    """
+    @_builtins.property
+    def region(self) -> Global___Region:
+        """Only the Gaussians whose means lie in this box of the map's world frame; unset for all."""
+
     def __init__(
         self,
         *,
         name: _builtins.str = ...,
         format: Global___MapFormat.ValueType = ...,
+        region: Global___Region | None = ...,
+        max_gaussians: _builtins.int = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["region", b"region"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["format", b"format", "name", b"name"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["format", b"format", "max_gaussians", b"max_gaussians", "name", b"name", "region", b"region"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -476,15 +532,22 @@ class GlobalMapHeader(_message.Message):
     FORMAT_FIELD_NUMBER: _builtins.int
     LENGTH_FIELD_NUMBER: _builtins.int
     SHA256_FIELD_NUMBER: _builtins.int
+    PART_FIELD_NUMBER: _builtins.int
     format: Global___MapFormat.ValueType
     """The file format of the chunks."""
     length: _builtins.int
     """Length of the file, bytes."""
     sha256: _builtins.bytes
-    """SHA-256 of the file, 32 bytes."""
+    """SHA-256 of the file, 32 bytes. The same part of the same map is the same file."""
     @_builtins.property
     def map(self) -> Global___GlobalMap:
-        """The map; its component and revision say what frame the Gaussians are in."""
+        """The map that was asked for, whole or in part; its component and revision say what frame the
+        Gaussians are in.
+        """
+
+    @_builtins.property
+    def part(self) -> Global___MapPart:
+        """What the file holds of the map; unset by a server that knows whole maps only."""
 
     def __init__(
         self,
@@ -493,14 +556,51 @@ class GlobalMapHeader(_message.Message):
         format: Global___MapFormat.ValueType = ...,
         length: _builtins.int = ...,
         sha256: _builtins.bytes = ...,
+        part: Global___MapPart | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["map", b"map"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["map", b"map", "part", b"part"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["format", b"format", "length", b"length", "map", b"map", "sha256", b"sha256"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["format", b"format", "length", b"length", "map", b"map", "part", b"part", "sha256", b"sha256"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___GlobalMapHeader: _TypeAlias = GlobalMapHeader  # noqa: Y015
+
+@_typing.final
+class MapPart(_message.Message):
+    """What a file holds of a map."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    REGION_FIELD_NUMBER: _builtins.int
+    MAX_GAUSSIANS_FIELD_NUMBER: _builtins.int
+    GAUSSIAN_COUNT_FIELD_NUMBER: _builtins.int
+    FULL_GAUSSIAN_COUNT_FIELD_NUMBER: _builtins.int
+    max_gaussians: _builtins.int
+    """The most Gaussians that were asked for; 0 for all."""
+    gaussian_count: _builtins.int
+    """Gaussians in the file."""
+    full_gaussian_count: _builtins.int
+    """Gaussians that the map has in the box. Where these are more, the file is less detailed."""
+    @_builtins.property
+    def region(self) -> Global___Region:
+        """The box that was asked for; unset for the whole map."""
+
+    def __init__(
+        self,
+        *,
+        region: Global___Region | None = ...,
+        max_gaussians: _builtins.int = ...,
+        gaussian_count: _builtins.int = ...,
+        full_gaussian_count: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["region", b"region"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["full_gaussian_count", b"full_gaussian_count", "gaussian_count", b"gaussian_count", "max_gaussians", b"max_gaussians", "region", b"region"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___MapPart: _TypeAlias = MapPart  # noqa: Y015
 
 @_typing.final
 class GetGlobalMapResponse(_message.Message):

@@ -97,7 +97,7 @@ class GlobalMapServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def GetGlobalMap(self, request, context):
-        """Streams a finished map: a header, then chunks of one file.
+        """Streams a map, whole or a part of it: a header, then chunks of one file.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -29,7 +29,7 @@ class GlobalMapServiceStub:
     ListOperations: _aio.UnaryUnaryMultiCallable[_global_map_service_pb2.ListOperationsRequest, _global_map_service_pb2.ListOperationsResponse]
     """Lists the operations of a session, oldest first."""
     GetGlobalMap: _aio.UnaryStreamMultiCallable[_global_map_service_pb2.GetGlobalMapRequest, _global_map_service_pb2.GetGlobalMapResponse]
-    """Streams a finished map: a header, then chunks of one file."""
+    """Streams a map, whole or a part of it: a header, then chunks of one file."""
 
 class GlobalMapServiceServicer(metaclass=_abc_1.ABCMeta):
     """Builds and serves global maps."""
@@ -76,6 +76,6 @@ class GlobalMapServiceServicer(metaclass=_abc_1.ABCMeta):
         request: _global_map_service_pb2.GetGlobalMapRequest,
         context: _aio.ServicerContext[_global_map_service_pb2.GetGlobalMapRequest, _abc.AsyncIterator[_global_map_service_pb2.GetGlobalMapResponse]],
     ) -> _abc.AsyncIterator[_global_map_service_pb2.GetGlobalMapResponse]:
-        """Streams a finished map: a header, then chunks of one file."""
+        """Streams a map, whole or a part of it: a header, then chunks of one file."""
 
 def add_GlobalMapServiceServicer_to_server(servicer: GlobalMapServiceServicer, server: _aio.Server) -> None: ...
