@@ -55,6 +55,11 @@ class RegistrationConfig:
     """Added where keyframes take part: the tracker drifts within their sub-maps."""
     keyframe_drift_rad: float = 0.002
     """The same for rotation."""
+    residual_share: float = 1.5
+    """Added to an accepted loop's error of translation for each metre that the aligned surfaces
+    stay apart (point-to-plane root mean square): drift within sub-maps keeps them apart."""
+    residual_lever_m: float = 2.0
+    """Distance at which that acts as rotation."""
 
     min_inliers: int = 4
     """Least inliers of the coarse method (its own count)."""
@@ -83,6 +88,10 @@ class RegistrationConfig:
             raise ConfigError.field(
                 "registration", "pyramid_levels and max_hypotheses are at least 1"
             )
-        for name in ("cloud_voxel_m", "max_depth_m", "depth_sigma_m", "texture_sigma"):
+        if self.residual_share < 0:
+            raise ConfigError.field("registration.residual_share", "must not be negative")
+        for name in (
+            "cloud_voxel_m", "max_depth_m", "depth_sigma_m", "texture_sigma", "residual_lever_m",
+        ):  # fmt: skip
             if getattr(self, name) <= 0:
                 raise ConfigError.field(f"registration.{name}", "must be > 0")

@@ -67,17 +67,22 @@ def register(
     if best is None:
         return _result(NO_HYPOTHESIS, None, clock() - started)
     reason = best.refusal(config) or ACCEPTED
-    return _result(reason, best, clock() - started, best.information(config))
+    information = best.information(config, rmse_m=best.figures.rmse_m)
+    return _result(reason, best, clock() - started, information)
 
 
 def loop_information(
-    hessian: Array, config: RegistrationConfig, *, by_anchors: bool = True
+    hessian: Array, config: RegistrationConfig, *, by_anchors: bool = True, rmse_m: float = 0.0
 ) -> Array:
     """The information of a loop edge from the Gauss-Newton matrix of all pixels.
 
-    Neighbouring pixels err together, and calibration and surface bias do not average out.
+    Neighbouring pixels err together, and calibration and surface bias do not average out. Nor does
+    what keeps two sub-maps' surfaces `rmse_m` apart where they lie best: each is bent by its own
+    drift, and another place of the same two would say another transform.
     """
-    variance_m2, variance_rad2 = config.systematic_m**2, config.systematic_rad**2
+    left_m = config.residual_share * rmse_m
+    variance_m2 = config.systematic_m**2 + left_m**2
+    variance_rad2 = config.systematic_rad**2 + (left_m / config.residual_lever_m) ** 2
     if not by_anchors:
         variance_m2 += config.keyframe_drift_m**2
         variance_rad2 += config.keyframe_drift_rad**2
@@ -100,10 +105,11 @@ class _Candidate:
         inliers = self.hypothesis.inliers
         return refusal(self.figures, inliers, self.information(config), config)
 
-    def information(self, config: RegistrationConfig) -> Array:
+    def information(self, config: RegistrationConfig, *, rmse_m: float = 0.0) -> Array:
         """Of target_from_source, (6, 6)."""
         by_anchors = self.pairs == (FramePair(0, 0),)
-        return loop_information(self.refined.hessian, config, by_anchors=by_anchors)
+        hessian = self.refined.hessian
+        return loop_information(hessian, config, by_anchors=by_anchors, rmse_m=rmse_m)
 
 
 def _best_candidate(

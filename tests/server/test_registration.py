@@ -182,6 +182,20 @@ def test_information_is_bounded_by_the_systematic_error():
     np.testing.assert_allclose(np.diag(covariance), expected, rtol=1e-3)
 
 
+def test_what_the_surfaces_stay_apart_counts_as_error_of_the_edge():
+    exact = np.linalg.inv(loop_information(np.eye(6) * 1e15, CONFIG))
+    apart = np.linalg.inv(loop_information(np.eye(6) * 1e15, CONFIG, rmse_m=0.02))
+    left_m = 0.02 * CONFIG.residual_share
+    added = [left_m**2] * 3 + [(left_m / CONFIG.residual_lever_m) ** 2] * 3
+    np.testing.assert_allclose(np.diag(apart - exact), added, rtol=1e-3)
+
+
+@pytest.mark.parametrize("wrong", [{"residual_share": -1.0}, {"residual_lever_m": 0.0}])
+def test_refuses_a_residual_that_means_nothing(wrong):
+    with pytest.raises(ConfigError, match="residual"):
+        RegistrationConfig(**wrong)
+
+
 def test_refuses_unknown_methods():
     with pytest.raises(ConfigError, match="methods"):
         RegistrationConfig(methods=("guess",))  # type: ignore[arg-type]
