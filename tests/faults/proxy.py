@@ -92,7 +92,7 @@ class Proxy:
             traffic.refused += 1
             return
         server, forth = await asyncio.open_connection(self._host, self._port)
-        link = _Link(self._budget(), self._rng)
+        link = _Link(self._budget())
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._pump(client, forth, link, counted=True))
@@ -100,7 +100,6 @@ class Proxy:
         except* OSError:
             pass  # one end is gone, and the other is sent away
         except* _Cut:
-            traffic.cuts += 1
             if self._rng.random() < weather.silent:
                 traffic.silences += 1
                 await asyncio.Event().wait()  # open, and dead: only keepalive finds out
@@ -113,6 +112,17 @@ class Proxy:
         if weather.cut_after is None or self.traffic.cuts >= weather.cuts:
             return None
         return self._rng.randint(*weather.cut_after)
+
+    def _may_cut(self, link: _Link) -> bool:
+        """Whether this connection ends now: others may have had the last of the cuts meanwhile."""
+        if link.cut:
+            return True
+        if self.traffic.cuts >= self._weather.cuts:
+            link.lasts()
+            return False
+        self.traffic.cuts += 1
+        link.cut = True
+        return True
 
     async def _pump(
         self,
@@ -129,6 +139,8 @@ class Proxy:
             if weather.bytes_per_s:
                 await asyncio.sleep(len(data) / weather.bytes_per_s)
             passed = link.take(data)
+            if len(passed) < len(data) and not self._may_cut(link):
+                passed = data
             sink.write(passed)
             await sink.drain()
             if counted:
@@ -146,9 +158,13 @@ class _Cut(Exception):
 class _Link:
     """One connection's two directions."""
 
-    def __init__(self, budget: int | None, rng: random.Random) -> None:
+    def __init__(self, budget: int | None) -> None:
         self._budget = budget
-        self._rng = rng
+        self.cut = False
+
+    def lasts(self) -> None:
+        """It carries whatever comes."""
+        self._budget = None
 
     def take(self, data: bytes) -> bytes:
         """As much of the data as still passes."""
