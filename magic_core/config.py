@@ -8,6 +8,7 @@ from the same definition (tyro), so a setting has one name everywhere: `tracking
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,7 +31,13 @@ def _converter() -> cattrs.Converter:
     return converter
 
 
+_EXPONENT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
+"""1e-7, a number for everyone who writes YAML, is text to PyYAML, which follows YAML 1.1."""
+
+
 def _strict_float(value: Any, _: type) -> float:
+    if isinstance(value, str) and _EXPONENT.fullmatch(value):
+        value = float(value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"{value!r} is not a number")
     return float(value)

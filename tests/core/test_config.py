@@ -38,6 +38,13 @@ def test_a_whole_number_is_a_number():
     assert from_mapping(Outer, {"inner": {"rate": 2}}).inner.rate == 2.0
 
 
+@pytest.mark.parametrize("written", ["1e-7", "1E-7", "1e-07", "+1e-7", "1.0e-7"])
+def test_a_number_may_have_an_exponent_without_a_point(written, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(f"inner: {{rate: {written}}}")
+    assert load_yaml(Outer, path).inner.rate == 1e-7
+
+
 @pytest.mark.parametrize(
     ("mapping", "named"),
     [
