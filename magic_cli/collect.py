@@ -98,6 +98,8 @@ def loop_record(loop: records.LoopCandidate) -> LoopRecord:
         rmse_m=loop.rmse_m,
         inliers=loop.inliers,
         overlap=loop.overlap,
+        source_keyframe=loop.source_keyframe,
+        target_keyframe=loop.target_keyframe,
     )
 
 

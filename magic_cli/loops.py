@@ -130,7 +130,10 @@ def _row(loop: LoopRecord) -> list[str]:
     else:
         figures = [f"{loop.overlap:.2f}", f"{loop.fitness:.2f}", f"{100 * loop.rmse_m:.1f} cm",
                    str(loop.inliers)]  # fmt: skip
-    names = [_short(loop.source), _short(loop.target)]
+    names = [
+        _short(loop.source, loop.source_keyframe),
+        _short(loop.target, loop.target_keyframe),
+    ]
     return [*names, f"{loop.similarity:.3f}", *figures, verdict, loop.reason]
 
 
@@ -168,5 +171,7 @@ def _place(name: str) -> tuple[str, int]:
     return agent_of(name), index_of(name)
 
 
-def _short(name: str) -> str:
-    return f"{agent_of(name)} {index_of(name)}"
+def _short(name: str, keyframe: int) -> str:
+    """Agent and sub-map; `@n` where keyframe n looks like the other side instead of the anchor."""
+    short = f"{agent_of(name)} {index_of(name)}"
+    return f"{short} @{keyframe}" if keyframe else short

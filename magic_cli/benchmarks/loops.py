@@ -102,6 +102,11 @@ def _compare_described(config: LoopsBenchmark) -> int:
             )
     for name, result in found.items():
         console.print(_described(name, result))
+        choose_ms = max(row["choose_ms"] for row in result["described"])
+        console.print(
+            f"encoder {result['describe_ms']:.1f} ms of processor per image, choosing at most "
+            f"{choose_ms:.1f} ms per sub-map"
+        )
     if config.json:
         print_json(found)
     return 0

@@ -76,7 +76,7 @@ class LoopRecord:
     target: str
     """Resource name of the other."""
     similarity: float
-    """Cosine similarity of the two anchor descriptors."""
+    """Cosine similarity of the two descriptors that are most alike."""
     verdict: str
     """`accepted` or `rejected`."""
     reason: str = ""
@@ -89,6 +89,10 @@ class LoopRecord:
     """Inlier correspondences of the coarse registration."""
     overlap: float = 0.0
     """Share of the two views that see the same surface."""
+    source_keyframe: int = 0
+    """Which keyframe of the source looks like the target; 0 is the anchor."""
+    target_keyframe: int = 0
+    """Which keyframe of the target looks like the source; 0 is the anchor."""
 
     @property
     def accepted(self) -> bool:

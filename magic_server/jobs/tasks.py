@@ -304,7 +304,7 @@ def _view(stored: StoredSubmap, keyframe: int, config: RegistrationConfig) -> An
         from magic_core.gaussians import codec
 
         means = codec.decode(stored.blobs[header.gaussians_blob].read()).means
-    return AnchorView(camera, colour, depth, tuple(keyframes), means)
+    return AnchorView(camera, colour, depth, tuple(keyframes), means, lead=int(keyframe > 0))
 
 
 def _images(

@@ -7,10 +7,11 @@ as a server does it, those that look alike in front.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,9 @@ from magic_server.registration.benchmark import (
 from magic_server.registration.config import RegistrationConfig
 from magic_server.registration.register import register
 from magic_server.registration.view import AnchorView, PreparedView, prepare
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 Choose = Callable[[AnchorView, int], Sequence[int]]
 """At most so many of a view's keyframes to describe, by their place behind the anchor, from 1."""
@@ -83,7 +87,8 @@ class _Verifier:
         if (submap, lead) not in self._views:
             view = self._submaps[submap].anchor.view
             order = sorted(range(len(view.keyframes)), key=lambda place: place + 1 != lead)
-            view = replace(view, keyframes=tuple(view.keyframes[place] for place in order))
+            keyframes = tuple(view.keyframes[place] for place in order)
+            view = replace(view, keyframes=keyframes, lead=int(lead > 0))
             self._views[submap, lead] = prepare(view, self._config)
         return self._views[submap, lead]
 
@@ -101,13 +106,17 @@ def run(
     config: RegistrationConfig | None = None,
     criteria: Criteria | None = None,
     progress: Progress = lambda share, text: None,
+    clock: Callable[[], float] = time.process_time,
 ) -> dict[str, Any]:
     """Detection and verification for each number of described keyframes.
 
-    Returns `submaps`, `pairs`, `loops` (pairs that share LOOP_OVERLAP) and, in `described`, per
-    number: descriptors per sub-map, candidates, loops found and accepted by overlap, wrong ones,
+    Returns `submaps`, `pairs`, `loops` (pairs that share LOOP_OVERLAP), `describe_ms` (median of
+    the encoder for one image) and, in `described`, per number: descriptors per sub-map,
+    `choose_ms` (median per sub-map), candidates, loops found and accepted by overlap, wrong ones,
     and the seconds that verification took.
     """
+    describe_s: list[float] = []
+    describe = _timed(describe, describe_s, clock)
     submaps = [
         _submap(anchor, describe)
         for path in datasets
@@ -117,7 +126,9 @@ def run(
     verifier = _Verifier(submaps, config or RegistrationConfig(), criteria or Criteria())
     rows = []
     for count in counts:
-        chosen = [[0, *choose(submap.anchor.view, count)] for submap in submaps]
+        choose_s: list[float] = []
+        choose_now = _timed(choose, choose_s, clock)
+        chosen = [[0, *choose_now(submap.anchor.view, count)] for submap in submaps]
         candidates = []
         for number, pair in enumerate(pairs):
             progress(number / len(pairs), f"{count} described keyframes")
@@ -125,14 +136,30 @@ def run(
             if similarity >= min_similarity:
                 candidates.append((pair, *verifier.verify(pair, leads)))
         per_submap = float(np.mean([len(places) for places in chosen]))
-        rows.append(_row(count, per_submap, pairs, candidates))
+        choose_ms = 1e3 * float(np.median(choose_s))
+        rows.append(_row(count, per_submap, pairs, candidates) | {"choose_ms": choose_ms})
     return {
         "submaps": len(submaps),
         "pairs": len(pairs),
         "loops": sum(pair.overlap >= LOOP_OVERLAP for pair in pairs),
         "min_similarity": min_similarity,
+        "describe_ms": 1e3 * float(np.median(describe_s)),
         "described": rows,
     }
+
+
+def _timed(
+    function: Callable[_P, _T], seconds: list[float], clock: Callable[[], float]
+) -> Callable[_P, _T]:
+    """The function; the seconds of each call are noted."""
+
+    def timed(*arguments: _P.args, **named: _P.kwargs) -> _T:
+        began = clock()
+        result = function(*arguments, **named)
+        seconds.append(clock() - began)
+        return result
+
+    return timed
 
 
 def _submap(anchor: Anchor, describe: Describe) -> _Submap:

@@ -138,6 +138,10 @@ def _best_candidate(
 def _hypotheses(
     source: PreparedView, target: PreparedView, config: RegistrationConfig
 ) -> Iterator[Hypothesis]:
+    if "visual" in config.methods and (source.lead or target.lead):
+        # What the two that look alike share is clearer without all the others' keypoints.
+        proposed = coarse_method("visual").propose(source.of_lead, target.of_lead, config)
+        yield from islice(proposed, config.max_hypotheses)
     for name in config.methods:
         proposed = coarse_method(name).propose(source, target, config)
         yield from islice(proposed, config.max_hypotheses)

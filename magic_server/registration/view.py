@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -36,6 +36,9 @@ class AnchorView:
     """Further images as (anchor_from_camera (4, 4), colour, depth), same camera."""
     means: Float32 | None = None
     """(n, 3) means of the sub-map's Gaussians, anchor frame; the method `means` needs them."""
+    lead: int = 0
+    """The image that looks like the other side: 0 the anchor's, 1 the first keyframe's, and so on;
+    registration begins there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,18 @@ class PreparedView:
     keypoint_frames: NDArray[np.int64]  # (k,) which frame shows the keypoint
     keypoint_descriptors: Float32  # (k, 128) RootSIFT
     means: Float32  # (g, 3) of the Gaussians, in the anchor frame, metres; none where not given
+    lead: int = 0  # the image that looks like the other side
+
+    @property
+    def of_lead(self) -> PreparedView:
+        """The same with the keypoints of the leading image alone."""
+        mine = self.keypoint_frames == self.lead
+        return replace(
+            self,
+            keypoints=self.keypoints[mine],
+            keypoint_frames=self.keypoint_frames[mine],
+            keypoint_descriptors=self.keypoint_descriptors[mine],
+        )
 
 
 def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
@@ -93,6 +108,7 @@ def prepare(view: AnchorView, config: RegistrationConfig) -> PreparedView:
         keypoint_frames=np.concatenate(owners).astype(np.int64),
         keypoint_descriptors=np.concatenate([descriptors for _, descriptors in keypoints]),
         means=np.zeros((0, 3), np.float32) if view.means is None else view.means,
+        lead=view.lead,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 
 import pytest
@@ -24,7 +25,10 @@ LOOPS = [
     loop(("agent_0", 1), ("agent_1", 2), 0.91, "accepted", "ACCEPTED", 0.8, 0.011, 60, 0.6),
     loop(("agent_0", 3), ("agent_1", 0), 0.84, "rejected", "LOW_OVERLAP", 0.7, 0.02, 12, 0.05),
     loop(("agent_1", 4), ("agent_1", 0), 0.95, "rejected", "FREE_SPACE", 0.5, 0.03, 30, 0.4),
-    loop(("agent_2", 0), ("agent_1", 1), 0.70, "rejected", "NO_HYPOTHESIS"),
+    dataclasses.replace(
+        loop(("agent_2", 0), ("agent_1", 1), 0.70, "rejected", "NO_HYPOTHESIS"),
+        target_keyframe=7,
+    ),
 ]
 
 
@@ -48,7 +52,16 @@ def test_every_candidate_is_listed_with_figures_and_reason(run, capsys, monkeypa
     assert [c["similarity"] for c in answer["candidates"]] == [0.95, 0.91, 0.84, 0.70]
     first = next(c for c in answer["candidates"] if c["reason"] == "ACCEPTED")
     assert (first["overlap"], first["fitness"], first["rmse_m"]) == (0.6, 0.8, 0.011)
-    for text in ("agent_0 1", "0.910", "1.1 cm", "LOW_OVERLAP", "--registration.min-overlap"):
+    last = answer["candidates"][-1]
+    assert (last["source_keyframe"], last["target_keyframe"]) == (0, 7)
+    for text in (
+        "agent_1 1 @7",
+        "agent_0 1",
+        "0.910",
+        "1.1 cm",
+        "LOW_OVERLAP",
+        "--registration.min-overlap",
+    ):
         assert text in table
 
 

@@ -47,6 +47,28 @@ def test_each_method_finds_the_transform_from_nothing(room, method):
     assert radians < 0.003
 
 
+def test_registration_begins_with_the_images_that_look_alike(room):
+    """Anchors look away from each other; the first keyframe of each sees what the other's does."""
+    anchors = pose(-0.4, -1.2, 190.0), pose(0.3, -0.9, 118.0)
+    views = []
+    for anchor, keyframe in zip(anchors, (FIRST, SECOND), strict=True):
+        relative = se3.inverse(anchor) @ keyframe
+        views.append(
+            replace(room.view(anchor), keyframes=((relative, *room.image(keyframe)),), lead=1)
+        )
+    source, target = (prepare(view, CONFIG) for view in views)
+    assert {*source.keypoint_frames.tolist()} == {0, 1}
+    assert {*source.of_lead.keypoint_frames.tolist()} == {1}
+    assert len(source.of_lead.keypoints) == (source.keypoint_frames == 1).sum()
+    result = register(source, target, CONFIG)
+    assert result.accepted, result
+    alone = register(source.of_lead, target.of_lead, CONFIG)
+    assert result.inliers == alone.inliers  # the hypothesis of these two images won
+    metres, radians = errors(result.target_from_source, se3.inverse(anchors[1]) @ anchors[0])
+    assert metres < 0.01
+    assert radians < 0.005
+
+
 def test_gaussian_means_register_and_are_needed(room):
     config = RegistrationConfig(methods=("means",))
     assert register(room.view(FIRST), room.view(SECOND), config).reason == "NO_HYPOTHESIS"
