@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -106,8 +107,27 @@ def test_the_kustomization_names_every_manifest_and_image() -> None:
     assert sorted(listed["resources"]) == sorted(MANIFESTS)
     (generated,) = listed["configMapGenerator"]
     assert generated["files"] == ["server.yaml=config.yaml"]
-    images = {image["name"] for image in listed["images"]}
-    assert pod_of("StatefulSet", "magic-server")[1]["image"] in images
+    pods = [pod_of("StatefulSet", "magic-server")]
+    pods += [
+        pod_of("Deployment", f"magic-{name}") for name in ("scheduler", "worker", "worker-gpu")
+    ]
+    images = {container["image"] for _, container in pods}
+    assert images == {image["name"] for image in listed["images"]}
+
+
+def test_the_kustomization_builds() -> None:
+    if shutil.which("kubectl") is None:
+        pytest.skip("kubectl is not here: the parts are checked, their sum is not")
+    built = subprocess.run(
+        ["kubectl", "kustomize", str(KUBERNETES)], capture_output=True, text=True, check=True
+    )
+    made = [document for document in yaml.safe_load_all(built.stdout) if document]
+    assert len(made) == 1 + sum(len(documents(name)) for name in MANIFESTS)
+    for document in made:
+        kubernetes_validate.validate(document, "1.33", strict=True)
+        if "template" in document.get("spec", {}):
+            (container,) = document["spec"]["template"]["spec"]["containers"]
+            assert container["image"].endswith(":latest"), container["image"]
 
 
 def test_servers_are_told_who_they_are_and_where_everything_is() -> None:
