@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magic_core.geometry import se3
 from magic_core.submap import OdometryEdge
 from magic_core.wire import names
-from magic_server.store import RemovedSubmap, Vertex
+from magic_server.store import GraphVertex, RemovedSubmap
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def joined(first: OdometryEdge, second: OdometryEdge) -> OdometryEdge:
 
 
 def bridged(
-    vertex: Vertex, removed: Mapping[str, RemovedSubmap]
+    vertex: GraphVertex, removed: Mapping[str, RemovedSubmap]
 ) -> tuple[OdometryEdge | None, Array | None]:
     """A sub-map's odometry edge to the nearest stored one before it, and its known start.
 

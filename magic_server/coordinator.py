@@ -20,7 +20,7 @@ import numpy as np
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core import logs, tracing
-from magic_core.errors import CorruptData, DiskFull, Unavailable
+from magic_core.errors import CorruptData, DiskFull, NotFound, Unavailable
 from magic_core.wire import names, records
 from magic_server.config import ServerConfig
 from magic_server.graph import SessionGraph
@@ -284,8 +284,12 @@ class SessionCoordinator:
         for candidate in left_over(
             query, keys, chosen, config, model_id=model_id, is_known_pair=self.graph.knows_pair
         ):
-            views = _views(self.graph.vertex(candidate.hit.name))
-            around = await self._places.nearest(views, config.top_k * QUERY_MARGIN)
+            _, agent, index = names.parse_submap(candidate.hit.name)
+            try:
+                older = await self._store.submaps.vertex(self.session, agent, index)
+            except NotFound:  # deleted meanwhile
+                continue
+            around = await self._places.nearest(_views(older), config.top_k * QUERY_MARGIN)
             would = select_candidates(
                 candidate.hit,
                 [(self._key(hit.name), hit.similarity) for hit in around],

@@ -18,14 +18,14 @@ from magic_server.bridging import bridged
 from magic_server.posegraph import Edge, PoseGraphConfig, stacked
 from magic_server.posegraph.arrays import ArraySolution
 from magic_server.posegraph.online import Change, NewVertex, OnlineGraph
-from magic_server.store import RemovedSubmap, Vertex
+from magic_server.store import GraphVertex, RemovedSubmap, Vertex
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
     """What a session's pose graph is made of."""
 
-    vertices: tuple[Vertex, ...]
+    vertices: tuple[GraphVertex, ...]
     loops: tuple[records.LoopCandidate, ...]
     """The accepted ones."""
 
@@ -36,10 +36,10 @@ class SessionGraph:
     def __init__(self, session: str, config: PoseGraphConfig) -> None:
         self._session = session
         self._config = config
-        self._vertices: dict[str, Vertex] = {}
+        self._vertices: dict[str, GraphVertex] = {}
         self._loops: dict[tuple[str, str], records.LoopCandidate] = {}
         self._removed: dict[str, RemovedSubmap] = {}
-        self._new_vertices: deque[Vertex] = deque()
+        self._new_vertices: deque[GraphVertex] = deque()
         self._new_loops: deque[records.LoopCandidate] = deque()
         self.online = OnlineGraph(config)
         self.edition = 0
@@ -63,10 +63,6 @@ class SessionGraph:
         """The sub-maps of an agent, all by resource name."""
         return {vertex.name for vertex in self._vertices.values() if vertex.agent == agent}
 
-    def vertex(self, submap: str) -> Vertex:
-        """A sub-map by resource name."""
-        return self._vertices[submap]
-
     def span_of(self, submap: str) -> tuple[float, float] | None:
         """Timestamps of a sub-map's first and last frame; None for one that is gone."""
         vertex = self._vertices.get(submap)
@@ -79,8 +75,8 @@ class SessionGraph:
 
     def add_vertex(self, vertex: Vertex) -> None:
         """A new sub-map; its place in the order of arrival is now."""
-        self._vertices[vertex.name] = vertex
-        self._new_vertices.append(vertex)
+        self._vertices[vertex.name] = bare = vertex.bare()
+        self._new_vertices.append(bare)
 
     def add_removed(self, removed: RemovedSubmap) -> None:
         """A deleted sub-map, over which odometry is carried on."""
@@ -190,7 +186,7 @@ class SessionGraph:
         """Revision 0."""
         return mapping_pb.PoseSnapshot(session=names.session_name(self._session))
 
-    def _joining(self, vertex: Vertex) -> NewVertex:
+    def _joining(self, vertex: GraphVertex) -> NewVertex:
         """A sub-map with its odometry and known start, carried on over deleted ones."""
         odometry, prior = bridged(vertex, self._removed)
         if odometry is None:

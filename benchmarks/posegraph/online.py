@@ -219,12 +219,12 @@ def _vertex(name: str, edge: Edge | None) -> Vertex:
     agent_name = names.agent_name(SESSION, agent)
     span_s = (float(index), float(index))
     return Vertex(
-        _full(name),
-        agent_name,
-        int(index),
-        DESCRIPTOR,
-        odometry,
-        None,
+        name=_full(name),
+        agent=agent_name,
+        index=int(index),
+        descriptor=DESCRIPTOR,
+        odometry=odometry,
+        prior=None,
         searched=True,
         span_s=span_s,
     )

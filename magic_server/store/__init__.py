@@ -11,6 +11,7 @@ from magic_server.store.leases import LeaseTable
 from magic_server.store.maps import NewMap, OpenOperation
 from magic_server.store.rows import (
     AgentRow,
+    GraphVertex,
     MapFile,
     NewSubmap,
     RemovedSubmap,
@@ -32,6 +33,7 @@ __all__ = [
     "Deleted",
     "DeletionRequest",
     "FirstAnswer",
+    "GraphVertex",
     "ImportRequest",
     "Imported",
     "ImportedSubmap",

@@ -37,22 +37,32 @@ class AgentRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Vertex:
-    """A sub-map as the descriptor index and the pose graph need it."""
+class GraphVertex:
+    """A sub-map as the pose graph needs it, as long as the session lasts."""
 
     name: str
     agent: str
     """Resource name of its agent."""
-    index: int
-    descriptor: Descriptor
     odometry: OdometryEdge | None
     prior: NDArray[np.float64] | None  # world_from_anchor (4, 4)
-    searched: bool
-    """Whether loop candidates were looked for."""
     span_s: tuple[float, float]
     """Timestamps of its first and its last frame, by the agent's clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vertex(GraphVertex):
+    """The same with what it is found by: the descriptor index keeps that."""
+
+    index: int
+    descriptor: Descriptor
+    searched: bool
+    """Whether loop candidates were looked for."""
     keyframes: tuple[DescribedKeyframe, ...] = ()
     """Those that have a descriptor of their own."""
+
+    def bare(self) -> GraphVertex:
+        """Without what it is found by."""
+        return GraphVertex(self.name, self.agent, self.odometry, self.prior, self.span_s)
 
 
 @dataclass(frozen=True, slots=True)

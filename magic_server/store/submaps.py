@@ -41,6 +41,9 @@ _SUMMARY = (
     submaps.c.stored_bytes,
     agents.c.name.label("agent"),
 )
+_VERTICES = sa.select(
+    *(column for column in submaps.c if column.name != "header"), agents.c.name.label("agent")
+).join(agents)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +133,20 @@ class SubmapTable:
         return StoredSubmap(row.header, blobs)
 
     async def vertices(self, session: SessionRow) -> list[Vertex]:
-        """Every sub-map of a session as the pose graph needs it, in order of arrival."""
-        columns = [c for c in submaps.c if c.name != "header"]
-        query = sa.select(*columns, agents.c.name.label("agent")).join(agents)
-        query = query.where(submaps.c.session_id == session.id).order_by(submaps.c.id)
+        """Every sub-map of a session as index and pose graph need it, in order of arrival."""
+        query = _VERTICES.where(submaps.c.session_id == session.id).order_by(submaps.c.id)
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
         return [_vertex(session, row) for row in rows]
+
+    async def vertex(self, session: SessionRow, agent: str, index: int) -> Vertex:
+        """One of them; NotFound when it is not stored."""
+        async with self._database.read() as connection:
+            found = await connection.execute(_VERTICES.where(_is(session, agent, index)))
+            row = found.one_or_none()
+        if row is None:
+            raise NotFound(f"{names.submap_name(session.name, agent, index)} is not stored")
+        return _vertex(session, row)
 
     async def removed(self, session: SessionRow) -> list[RemovedSubmap]:
         """The deleted sub-maps of agents that are still there."""
