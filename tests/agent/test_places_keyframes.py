@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from magic_agent.agent import Agent
+from magic_agent.client import MagicClient
 from magic_agent.config import AgentConfig
+from magic_agent.mapping import MappingConfig
 from magic_agent.places.keyframes import spread_keyframes, with_described_keyframes
+from magic_agent.slam_config import SubmapConfig
+from magic_core.data import Frame
 from magic_core.errors import ConfigError
 from magic_core.geometry import se3
 from magic_core.submap import Descriptor, Keyframe
-from tests.small_world import LARGE, look, make_submap, render, thumbnail
+from tests.small_world import DIMENSION, LARGE, MODEL_ID, look, make_submap, render, thumbnail
 
 
 def keyframes_at(*poses: np.ndarray) -> list[Keyframe]:
@@ -84,3 +90,58 @@ def test_a_number_that_no_server_takes_is_refused(count: int) -> None:
     with pytest.raises(ConfigError, match=f"places_keyframes: {count}: expected 0 to 32"):
         AgentConfig(places_keyframes=count).validate()
     AgentConfig(places_keyframes=32).validate()
+
+
+CAMERA = LARGE.scaled(0.5)
+
+
+class Turn:
+    """A camera that turns where it stands, 60 degrees in all."""
+
+    name, camera = "agent_0", CAMERA
+
+    def __init__(self) -> None:
+        poses = [look(-0.8, -0.8, np.radians(2.5 * step)) for step in range(25)]
+        self._frames = [Frame(n, n / 30, *render(CAMERA, pose)) for n, pose in enumerate(poses)]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self._frames[index]
+
+
+class Thumbnails:
+    """A weak but real descriptor model."""
+
+    model_id, dimension = MODEL_ID, DIMENSION
+    describe = staticmethod(thumbnail)
+
+
+async def test_an_agent_sends_descriptors_of_at_most_so_many_keyframes(
+    client: MagicClient, tmp_path: Path
+) -> None:
+    source = Turn()
+    agent = Agent(
+        source,
+        client,
+        session="turn",
+        name="agent_0",
+        config=AgentConfig(
+            places_keyframes=2,
+            mapping=MappingConfig(iterations=4, anchor_iterations=8, closing_iterations=0),
+            submap=SubmapConfig(frames=40, min_anchor_overlap=0.0),
+        ),
+        model=Thumbnails(),
+        folder=tmp_path / "agent_0",
+    )
+    tally = await agent.run()
+    assert tally.completed
+    (info,) = await client.list_submaps("turn")
+    header = (await client.download_encoded(info.name)).header
+    described = [one for one in header.keyframes if one.image_descriptor]
+    assert 1 <= len(described) <= 2
+    assert not header.keyframes[0].image_descriptor
+    for keyframe in described:
+        expected = thumbnail(source[keyframe.frame_index].colour).vector
+        np.testing.assert_array_equal(np.float32(keyframe.image_descriptor), expected)
