@@ -1,6 +1,7 @@
 """`magic loops RUN`: every loop candidate, what was measured of it, and why it was believed or not.
 
-RUN is a run folder, or the address of a live server (then --session names the session).
+RUN is a run folder, or the address of a live server (then --session names the session). `agent_0 3
+@5` is sub-map 3 of agent_0 where its keyframe 5 looks like the other side, instead of its anchor.
 
 Examples:
   magic loops runs/demo
