@@ -16,6 +16,7 @@ from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
 from magic_core.errors import InvalidInput, MagicError, NotFound, WrongState
 from magic_core.wire import geometry, names, records
+from magic_server.blockwise import BlockwiseMerge, is_blockwise
 from magic_server.config import ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
@@ -166,7 +167,7 @@ class GlobalMaps:
         try:
             try:
                 task = await self._task(coordinator, chosen, request, delivery)
-                outcome = await self._followed(operation, task)
+                outcome = await self._followed(operation, task, folder)
             except Exception as error:
                 _require_all(coordinator, chosen, error)
                 raise
@@ -198,21 +199,35 @@ class GlobalMaps:
             config = dataclasses.replace(config, refine=False, fill=False)
         return MergeTask(tuple(placed), config, self._config.jobs.merge_threads, delivery)
 
-    async def _followed(self, operation: int, task: MergeTask) -> MergeOutcome:
+    async def _followed(self, operation: int, task: MergeTask, folder: Path) -> MergeOutcome:
         """Run the merge and store its progress while it goes on."""
         await self._advance(operation, "RUNNING", 0.0, "starting")
-        job = self._tasks.start(self._jobs.run(merge_submaps, task), name="merge job")
+        if await self._in_thread(is_blockwise, task):
+            merge = self._blockwise(task, folder)
+            work, reported = merge.run(), merge.progress
+        else:
+            work, reported = self._jobs.run(merge_submaps, task), task.delivery.progress
+        job = self._tasks.start(work, name="merge job")
         last = None
         try:
             while not job.done():
                 await asyncio.wait([job], timeout=self._deliveries.poll_s)
-                progress = await self._in_thread(task.delivery.progress)
+                progress = await self._in_thread(reported)
                 if progress is not None and progress != last:
                     last = progress
                     await self._advance(operation, "RUNNING", *progress)
             return job.result()
         finally:
             job.cancel()  # where the operation is given up
+
+    def _blockwise(self, task: MergeTask, folder: Path) -> BlockwiseMerge:
+        config = self._config.jobs
+        at_once = config.merge_blocks
+        if not at_once:
+            at_once = 1 if config.executor == "pool" else self._jobs.workers
+        return BlockwiseMerge(
+            task, folder, jobs=self._jobs, deliveries=self._deliveries, at_once=at_once
+        )
 
     async def _keep(
         self,

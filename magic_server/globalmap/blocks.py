@@ -2,8 +2,8 @@
 
 A k-d tree over what the keyframes look at cuts space into boxes until a box's keyframes are few
 enough. Each Gaussian belongs to the one box that holds its mean. A box is refined with the
-keyframes that look into it and with all Gaussians that these show; only its own are kept (the
-scheme of VastGaussian, Lin et al., CVPR 2024). Boxes done before are context as refined.
+keyframes that look into it and with all Gaussians that these show, as agents sent them; only its
+own are kept (the scheme of VastGaussian, Lin et al., CVPR 2024). No box waits for another.
 """
 
 from __future__ import annotations
@@ -42,22 +42,39 @@ class ViewPlace:
 
 
 @dataclass(frozen=True, slots=True)
+class BlockView:
+    """A keyframe that teaches a block."""
+
+    source: int
+    """Index of its sub-map."""
+    keyframe: int
+
+
+@dataclass(frozen=True, slots=True)
 class Block:
     """A box of space, open towards the outside of the map, and the keyframes that teach it."""
 
     low: Point  # (3,) metres, inclusive
     high: Point  # (3,) metres, exclusive
-    views: tuple[ViewPlace, ...]
+    views: tuple[BlockView, ...]
+    reach_low: Point
+    """(3,) lowest corner of all that its keyframes show, metres."""
+    reach_high: Point
 
     def holds(self, points: NDArray) -> NDArray[np.bool_]:
         """(n,) which points (n, 3) lie in the box."""
         return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
 
-    def surroundings(self) -> tuple[Point, Point]:
-        """Lowest and highest corner of all that its keyframes show."""
-        seen = np.concatenate([view.seen for view in self.views])
-        low, high = np.percentile(seen, (_REACH_PERCENTILE, 100 - _REACH_PERCENTILE), axis=0)
-        return low - _MARGIN_M, high + _MARGIN_M
+    def wants(self, points: NDArray) -> NDArray[np.bool_]:
+        """(n,) which points (n, 3) lie in the box or in what its keyframes show."""
+        near = ((points >= self.reach_low) & (points <= self.reach_high)).all(axis=1)
+        return self.holds(points) | near
+
+    def touches(self, low: Point, high: Point) -> bool:
+        """Whether it may want points of a box."""
+        inside = (high >= self.low) & (low < self.high)
+        near = (high >= self.reach_low) & (low <= self.reach_high)
+        return bool(inside.all() or near.all())
 
 
 def places_of(sources: Sequence[PlacedSource]) -> list[ViewPlace]:
@@ -109,13 +126,28 @@ def _split(
 def _with_guests(
     own: list[ViewPlace], low: Point, high: Point, places: Sequence[ViewPlace], *, most: int
 ) -> Block:
-    box = Block(low, high, ())
     mine = {(place.source, place.keyframe) for place in own}
     shares = [
-        (float(box.holds(place.seen).mean()), number)
+        (float(((place.seen >= low) & (place.seen < high)).all(axis=1).mean()), number)
         for number, place in enumerate(places)
         if (place.source, place.keyframe) not in mine
     ]
     best = sorted((pair for pair in shares if pair[0] >= _GUEST_SHARE), reverse=True)[:most]
     chosen = [*own, *(places[number] for _, number in best)]
-    return Block(low, high, tuple(sorted(chosen, key=lambda p: (p.source, p.keyframe))))
+    views = [BlockView(place.source, place.keyframe) for place in chosen]
+    seen = np.concatenate([place.seen for place in chosen])
+    reach = np.percentile(seen, (_REACH_PERCENTILE, 100 - _REACH_PERCENTILE), axis=0)
+    return Block(
+        low,
+        high,
+        tuple(sorted(views, key=lambda view: (view.source, view.keyframe))),
+        reach[0] - _MARGIN_M,
+        reach[1] + _MARGIN_M,
+    )
+
+
+def blocks_near(blocks: Sequence[Block], number: int) -> list[int]:
+    """The other blocks that a block's keyframes may show."""
+    block = blocks[number]
+    others = (i for i in range(len(blocks)) if i != number)
+    return [i for i in others if block.touches(blocks[i].low, blocks[i].high)]

@@ -6,22 +6,22 @@ the mapping losses and removes what turned transparent. Memory holds one block a
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.morton import in_morton_order
 from magic_core.render import LossWeights
 from magic_core.render.backend import Optimiser, new_optimiser
-from magic_server.globalmap.blocks import Block, places_of, plan_blocks
+from magic_server.globalmap.blocks import Block, blocks_near, places_of, plan_blocks
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.parts import Parts, fingerprint_of
 from magic_server.globalmap.placement import (
@@ -31,10 +31,15 @@ from magic_server.globalmap.placement import (
     view_of,
 )
 from magic_server.globalmap.quality import mean_psnr
-from magic_server.globalmap.refine import FineResult, FineStage, rates
+from magic_server.globalmap.refine import FineResult, FineStage, budget_of, rates
 
 Progress = Callable[[float, str], None]
 
+_TOUCHED = 0.4
+"""Share of the schedule, its last, that a block goes through once more beside refined neighbours:
+0.2 leaves the borders where they were, 0.4 closes them (benchmarks/results/global-map.md)."""
+REFINED = 0.8
+"""Share of the progress when each block has been refined by itself."""
 _JUDGED_VIEWS = 24  # keyframes of a block on which the merge reports its own quality
 
 
@@ -93,11 +98,7 @@ def merge_into(
     if config.refine:
         progress(0.0, "dividing space into blocks")
         blocks = plan_blocks(places_of(sources), most_views=config.block_views)
-        figures = [
-            parts.finished(number)
-            or _refine_block(number, blocks, parts, sources, config, progress)
-            for number in range(len(blocks))
-        ]
+        parts, figures = _in_blocks(blocks, parts, sources, config, progress)
     else:
         figures = _append(parts, sources, progress)
     progress(1.0, f"merged {sum(item['gaussians'] for item in figures)} Gaussians")
@@ -118,24 +119,68 @@ def _append(
     return figures
 
 
-def _refine_block(
-    number: int,
+def _in_blocks(
     blocks: Sequence[Block],
     parts: Parts,
     sources: Sequence[PlacedSource],
     config: MergeConfig,
     progress: Progress,
+) -> tuple[Parts, list[dict[str, Any]]]:
+    """Each block refined by itself, then, where there are several, once more beside the others."""
+    numbers = range(len(blocks))
+    if len(blocks) == 1:
+        return parts, [refine_block(blocks[0], parts, sources, config, progress=progress)]
+
+    def part(number: int, first: float, last: float, name: str) -> Progress:
+        def within(share: float, text: str) -> None:
+            done = first + (last - first) * (number + share) / len(blocks)
+            progress(done, f"{name} {number + 1} of {len(blocks)}: {text}")
+
+        return within
+
+    apart = [
+        refine_block(
+            blocks[number], parts, sources, config, number=number,
+            progress=part(number, 0.0, REFINED, "block"),
+        )
+        for number in numbers
+    ]  # fmt: skip
+    touched = parts.beside("touched")
+    together = [
+        touch_up(
+            blocks[number], parts.cloud(number),
+            (parts.cloud(other) for other in blocks_near(blocks, number)),
+            touched, sources, config, number=number,
+            progress=part(number, REFINED, 1.0, "border of block"),
+        )
+        for number in numbers
+    ]  # fmt: skip
+    return touched, [_both(*pair) for pair in zip(apart, together, strict=True)]
+
+
+def _both(apart: dict[str, Any], together: dict[str, Any]) -> dict[str, Any]:
+    """The figures of a block over both rounds."""
+    sums = {name: apart[name] + together[name] for name in ("iterations", "pruned")}
+    last = {name: together[name] for name in ("gaussians", "psnr_fine_db")}
+    return {**apart, **sums, **last}
+
+
+def refine_block(
+    block: Block,
+    parts: Parts,
+    sources: Sequence[PlacedSource],
+    config: MergeConfig,
+    *,
+    number: int = 0,
+    progress: Progress,
 ) -> dict[str, Any]:
-    block = blocks[number]
-
-    def within(share: float, text: str) -> None:
-        named = f"block {number + 1} of {len(blocks)}: {text}" if len(blocks) > 1 else text
-        progress((number + share) / len(blocks), named)
-
-    within(0.0, "appending sub-maps")
-    views = [view_of(sources[place.source], place.keyframe) for place in block.views]
+    """Refine one block by itself and keep it in `parts`; its figures, at once where it is there."""
+    if (finished := parts.finished(number)) is not None:
+        return finished
+    progress(0.0, "appending sub-maps")
+    views = [view_of(sources[view.source], view.keyframe) for view in block.views]
     judged = _spread(views, _JUDGED_VIEWS)
-    coarse, own = _coarse_of(block, blocks[:number], parts, sources)
+    coarse, own = _coarse_of(block, sources)
     before = mean_psnr(optimiser_of(coarse, config), judged)
     taken_up = parts.resumed(number)
     cloud, done = (coarse, 0) if taken_up is None else (taken_up[0], int(taken_up[1]["done"]))
@@ -145,7 +190,7 @@ def _refine_block(
         optimiser,
         views,
         config,
-        progress=within,
+        progress=progress,
         checkpoint=lambda cloud, done: parts.checkpoint(number, cloud, {"done": done}),
         done=done,
     )
@@ -158,33 +203,55 @@ def _refine_block(
     return figures
 
 
-def _coarse_of(
-    block: Block, done: Sequence[Block], parts: Parts, sources: Sequence[PlacedSource]
-) -> tuple[GaussianCloud, int]:
+def touch_up(
+    block: Block,
+    own: GaussianCloud,
+    neighbours: Iterable[GaussianCloud],
+    parts: Parts,
+    sources: Sequence[PlacedSource],
+    config: MergeConfig,
+    *,
+    number: int = 0,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Run the last part of a refined block's schedule once more, beside refined neighbours.
+
+    Each block was refined beside neighbours as they were sent, which are no longer there. All
+    blocks see the others as of the first round, so that the order changes nothing.
+    """
+    if (finished := parts.finished(number)) is not None:
+        return finished
+    progress(0.0, "refining beside its neighbours")
+    views = [view_of(sources[view.source], view.keyframe) for view in block.views]
+    near = [cloud.select(block.wants(cloud.means)) for cloud in neighbours]
+    optimiser = optimiser_of(in_morton_order(GaussianCloud.concatenate([own, *near])), config)
+    del near
+    budget = budget_of(views, config)
+    begun = budget - int(_TOUCHED * budget)
+    stage = FineStage(optimiser, views, config, progress=progress, done=begun)
+    result = stage.run()
+    result = dataclasses.replace(result, iterations=result.iterations - begun)
+    after = mean_psnr(optimiser, _spread(views, _JUDGED_VIEWS))
+    refined = optimiser.gaussians()
+    refined = refined.select(block.holds(refined.means))
+    figures = _figures(refined, result, coarse=len(own), psnr=(None, after), views=len(views))
+    parts.finish(number, refined, figures)
+    return figures
+
+
+def _coarse_of(block: Block, sources: Sequence[PlacedSource]) -> tuple[GaussianCloud, int]:
     """The Gaussians that a block's keyframes may show, and how many of them are its own.
 
-    Neighbours that are done are taken as refined, the others as their agents sent them.
+    All as their agents sent them, its neighbours' too: no block waits for another, and the map does
+    not depend on the order in which they are refined.
     """
-    low, high = block.surroundings()
     chosen: list[GaussianCloud] = []
     own = 0
     for source in sources:
         cloud = placed_gaussians(source)
-        inside = block.holds(cloud.means)
-        near = _between(cloud.means, low, high)
-        for earlier in done:
-            near &= ~earlier.holds(cloud.means)
-        own += int(inside.sum())
-        chosen.append(cloud.select(inside | near))
-    for number in range(len(done)):
-        cloud = parts.cloud(number)
-        chosen.append(cloud.select(_between(cloud.means, low, high)))
+        own += int(block.holds(cloud.means).sum())
+        chosen.append(cloud.select(block.wants(cloud.means)))
     return in_morton_order(GaussianCloud.concatenate(chosen)), own
-
-
-def _between(points: NDArray, low: NDArray, high: NDArray) -> NDArray[np.bool_]:
-    """(n,) which points (n, 3) lie in a box."""
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
 
 def optimiser_of(cloud: GaussianCloud, config: MergeConfig) -> Optimiser:

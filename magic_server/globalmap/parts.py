@@ -29,7 +29,7 @@ class Parts:
 
     def __init__(self, folder: Path, fingerprint: str) -> None:
         """Take up a folder where its plan is the same, else empty it."""
-        self._folder = folder
+        self._folder, self._fingerprint = folder, fingerprint
         folder.mkdir(parents=True, exist_ok=True)
         plan = folder / "plan.json"
         if not plan.is_file() or plan.read_text() != json.dumps(fingerprint):
@@ -38,13 +38,21 @@ class Parts:
                     leftover.unlink()
             _replace(plan, json.dumps(fingerprint).encode())
 
+    def beside(self, name: str) -> Parts:
+        """Blocks of another round of the same merge, in a folder in this one."""
+        return Parts(self._folder / name, f"{self._fingerprint} {name}")
+
     def finished(self, block: int) -> dict[str, Any] | None:
         """The figures of a block that is done."""
         return _read_json(self._folder / f"block_{block:04d}.json")
 
+    def path(self, block: int) -> Path:
+        """The file of a block that is done."""
+        return self._folder / f"block_{block:04d}.mgsc"
+
     def cloud(self, block: int) -> GaussianCloud:
         """A block that is done."""
-        return codec.decode((self._folder / f"block_{block:04d}.mgsc").read_bytes())
+        return codec.decode(self.path(block).read_bytes())
 
     def clouds(self, count: int) -> Iterator[GaussianCloud]:
         """All blocks, one at a time."""
@@ -53,7 +61,7 @@ class Parts:
 
     def finish(self, block: int, cloud: GaussianCloud, figures: dict[str, Any]) -> None:
         """Keep a block that is done."""
-        _replace(self._folder / f"block_{block:04d}.mgsc", codec.encode_lossless(cloud))
+        _replace(self.path(block), codec.encode_lossless(cloud))
         _replace(self._folder / f"block_{block:04d}.json", json.dumps(figures).encode())
         for leftover in self._folder.glob(f"open_{block:04d}.*"):
             leftover.unlink()

@@ -72,7 +72,7 @@ class FineStage:
         self._last_loss = np.full(len(views), np.nan)
         self._exposure = ExposureModel(len(views)) if config.exposure else None
         self._steps_per_pass = max(len(views), _MIN_STEPS_PER_PASS)
-        self._budget = min(config.iterations, config.passes * self._steps_per_pass)
+        self._budget = budget_of(views, config)
 
     def run(self) -> FineResult:
         """Prune, fill and optimise until the losses settle or the budget is spent."""
@@ -168,6 +168,11 @@ class FineStage:
         if not mask.all():
             self._optimiser.prune(mask)
         return int((~mask).sum())
+
+
+def budget_of(views: Sequence[View], config: MergeConfig) -> int:
+    """Most optimisation steps on these keyframes."""
+    return min(config.iterations, config.passes * max(len(views), _MIN_STEPS_PER_PASS))
 
 
 def rates(config: MergeConfig, progress: float) -> LearningRates:

@@ -48,6 +48,9 @@ class JobConfig:
     """pool: threads of the numerical libraries in each."""
     merge_threads: int = 0
     """Threads of a merge's rasteriser; 0 takes one per core."""
+    merge_blocks: int = 0
+    """Blocks of one merge that are refined at the same time; 0 is one in a pool, whose memory and
+    cores it shares with all else, and as many as there are workers on a cluster."""
     niceness: int = 5
     """pool: added to the workers' niceness, so that requests are answered while they compute."""
     scheduler: str = ""
@@ -66,6 +69,8 @@ class JobConfig:
     def __post_init__(self) -> None:
         if self.workers < 1 or self.threads_per_worker < 1 or self.merge_threads < 0:
             raise ConfigError.field("jobs", "workers and threads_per_worker are at least 1")
+        if self.merge_blocks < 0:
+            raise ConfigError.field("jobs.merge_blocks", f"{self.merge_blocks}: expected 0 or more")
         if self.in_flight < 1:
             raise ConfigError.field("jobs.in_flight", f"{self.in_flight}: expected at least 1")
         if not 0.0 < self.connect_timeout_s <= 3600.0:

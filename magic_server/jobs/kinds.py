@@ -31,6 +31,10 @@ KINDS = {
     "make_excerpt": JobKind(15, patient=False),
     "append_submaps": JobKind(10, patient=False),
     "merge_submaps": JobKind(0, refines=True),
+    "plan_merge": JobKind(0, refines=True),
+    "refine_block": JobKind(0, refines=True),
+    "touch_up_block": JobKind(0, refines=True),
+    "join_blocks": JobKind(0, refines=True),
 }
 OTHER = JobKind(20)
 

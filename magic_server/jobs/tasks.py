@@ -24,6 +24,7 @@ from magic_server.store.rows import StoredSubmap
 
 if TYPE_CHECKING:
     from magic_core.gaussians import GaussianCloud
+    from magic_core.gaussians.stream import Pieces
     from magic_core.wire.records import MapFormat
     from magic_server.globalmap import MergeConfig
     from magic_server.posegraph import PoseGraphConfig
@@ -233,7 +234,6 @@ def merge_submaps(task: MergeTask) -> MergeOutcome:
 def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
     threads = task.threads or os.cpu_count() or 1
     os.environ["MAGIC_THREADS"] = str(threads)
-    from magic_core.gaussians import stream
     from magic_server.globalmap.merge import merge_into
 
     attempt, tell = Attempt(folder), SpacedReports(task.delivery)
@@ -248,6 +248,17 @@ def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
     sources = [StoredSource.of(item) for item in task.submaps]
     parts, summary = merge_into(folder, sources, config, progress=report)
     pieces = functools.partial(parts.clouds, summary.blocks)
+    return write_map(
+        pieces, summary.gaussians, folder=folder, attempt=attempt, delivery=task.delivery
+    )
+
+
+def write_map(
+    pieces: Pieces, count: int, *, folder: Path, attempt: Attempt, delivery: Delivery
+) -> MergeOutcome:
+    """Write a map of `count` Gaussians in every format and hand the files over."""
+    from magic_core.gaussians import stream
+
     made = []
     for name, write in (
         ("map.ply", stream.write_ply_pieces),
@@ -257,8 +268,8 @@ def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
         path = folder / name
         with attempt.file(path) as partial:
             write(partial, pieces)
-        made.append(task.delivery.deliver(path))
-    return MergeOutcome(summary.gaussians, *made)
+        made.append(delivery.deliver(path))
+    return MergeOutcome(count, *made)
 
 
 @functools.lru_cache(maxsize=16)
