@@ -24,6 +24,7 @@ Float64 = NDArray[np.float64]
 _COLOUR_DISTANCE_M = 0.2
 """Metres between two Gaussians that matter as much as black beside white in one channel."""
 _MOST_PER_ROUND = 0.25  # of all Gaussians that are merged away before neighbours are looked up anew
+_LEAST_PER_ROUND = 0.0625  # of all pairs, so that no cloud takes a round for each Gaussian
 _MAX_OPACITY = 0.999
 _MOST_SURPLUS = 2.0  # two opaque Gaussians in one place
 _MIN_SCALE_M = 1e-9
@@ -101,6 +102,9 @@ def _with_pairs_merged(moments: _Moments, excess: int) -> _Moments:
     before, after = np.append(np.inf, cost[:-1]), np.append(cost[1:], np.inf)
     pairs = np.flatnonzero((cost <= before) & (cost < after))
     most = min(excess, max(1, int(_MOST_PER_ROUND * len(moments.weights))))
+    if len(pairs) < min(most, _LEAST_PER_ROUND * len(cost)):
+        # Costs that are equal, or grow along the curve, have hardly such pairs: every other one.
+        pairs = np.arange(0, len(cost), 2)
     chosen = pairs[np.argsort(cost[pairs], kind="stable")[:most]]
     alone = np.ones(len(moments.weights), dtype=bool)
     alone[chosen] = alone[chosen + 1] = False

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magic_core.errors import CorruptData, InvalidInput, NotFound
-from magic_core.gaussians import GaussianCloud, codec, stream
+from magic_core.gaussians import GaussianCloud, codec, reduction, stream
 from magic_core.gaussians.columns import ColumnFile
 from magic_core.gaussians.reduction import reduced
 from magic_core.gaussians.region import Region
@@ -104,6 +104,31 @@ def test_extreme_clouds_become_valid_ones(count):
     found = reduced(cloud, count)
     found.validate()
     assert len(found) == count
+
+
+@pytest.mark.parametrize(
+    "x",
+    [np.zeros(4096), np.arange(4096) * 0.25, 1e-3 * 1.002 ** np.arange(4096)],
+    ids=["one place", "a row", "a row that opens"],
+)
+def test_clouds_without_cheapest_pairs_take_few_rounds(monkeypatch, x):
+    cloud = GaussianCloud.from_arrays(
+        np.stack([x, np.zeros(4096), np.zeros(4096)], axis=1),
+        np.tile([1.0, 0.0, 0.0, 0.0], (4096, 1)),
+        scales=np.full((4096, 3), 0.01),
+        opacities=np.full(4096, 0.5),
+        colours=np.full((4096, 3), 0.5),
+    )
+    rounds = []
+    merged = reduction._with_pairs_merged
+    monkeypatch.setattr(
+        reduction, "_with_pairs_merged", lambda *given: rounds.append(1) or merged(*given)
+    )
+    found = reduced(cloud, 512)
+    found.validate()
+    assert len(found) == 512
+    # One for each Gaussian that goes would be 3,584.
+    assert len(rounds) < 100
 
 
 @pytest.mark.parametrize(
