@@ -53,7 +53,7 @@ class ViewCommand:
     rerun: Path | None = None
     """Write what happens to this Rerun recording (.rrd) too; needs the extra `rerun`."""
     max_splats: int = 1_000_000
-    """Gaussians sent to the browser at most; more are thinned evenly."""
+    """Gaussians sent to the browser at most; of more, neighbours that are alike are merged."""
     interval_s: float = 0.5
     """Time between two looks at the server, seconds."""
     credentials: ClientCredentials = field(default_factory=ClientCredentials)

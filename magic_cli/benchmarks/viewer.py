@@ -5,7 +5,7 @@ time is that of the viewer's process alone.
 
 Examples:
   magic bench viewer --json
-  magic bench viewer --gaussians 4000000      # more than are sent: they are thinned
+  magic bench viewer --gaussians 4000000      # more than are sent: they are merged
 """
 
 from __future__ import annotations

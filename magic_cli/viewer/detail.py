@@ -6,26 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_core.gaussians import GaussianCloud
-from magic_core.gaussians.morton import in_morton_order
+from magic_core.gaussians.reduction import reduced
 from magic_core.geometry import se3
 
 _ALPHA_SHOWN = 0.05
 
 
 def thinned(cloud: GaussianCloud, keep_every: int) -> GaussianCloud:
-    """Every k-th Gaussian in Morton order, larger by sqrt(k) so that surfaces stay closed.
+    """A k-th as many Gaussians that show the same: neighbours that are alike are merged.
 
     Those fainter than 0.05 are left out; they show nothing and cost as much as the others.
     """
     shown = cloud.select(cloud.opacities > _ALPHA_SHOWN)
-    if keep_every <= 1:
-        return shown
-    kept = in_morton_order(shown).select(np.arange(0, len(shown), keep_every))
-    flattest = kept.scales.min(axis=1, keepdims=True)
-    wider = np.where(kept.scales > flattest, kept.scales * np.sqrt(keep_every), kept.scales)
-    return GaussianCloud.from_arrays(
-        kept.means, kept.quaternions, scales=wider, opacities=kept.opacities, colours=kept.colours
-    )
+    return reduced(shown, max(-(-len(shown) // keep_every), 1))
 
 
 def keep_every(total: int, limit: int) -> int:
