@@ -55,8 +55,8 @@ class _Entry:
     made: ExcerptOutcome | None = None
     users: int = 0
     used_at: float = field(default_factory=time.monotonic)
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Held by whoever makes it; the others wait for that."""
+    making: asyncio.Task[ExcerptOutcome | Exception] | None = None
+    """The newest try at it, for which all who want it wait."""
 
 
 class _Use:
@@ -147,11 +147,29 @@ class Excerpts:
         return self._entries.pop(oldest)
 
     async def _made(self, entry: _Entry, key: ExcerptKey, source: StreamedFile) -> ExcerptOutcome:
-        async with entry.lock:
-            if entry.made is None:
-                task = ExcerptTask(source, key.region, key.max_gaussians, key.kind, entry.delivery)
-                entry.made = await self._jobs.run(make_excerpt, task)
+        if entry.made is not None:
             return entry.made
+        if entry.making is None or entry.making.done():
+            task = ExcerptTask(source, key.region, key.max_gaussians, key.kind, entry.delivery)
+            entry.making = self._tasks.start(self._make(_Use(entry), key, task), name="making")
+        found = await asyncio.shield(entry.making)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    async def _make(
+        self, use: _Use, key: ExcerptKey, task: ExcerptTask
+    ) -> ExcerptOutcome | Exception:
+        """Goes on when nobody waits any more: a worker that has begun does not stop, and what it
+        leaves would lie there unknown."""
+        try:
+            use.entry.made = await self._jobs.run(make_excerpt, task)
+            return use.entry.made
+        except Exception as error:  # those who wait raise it
+            return error
+        finally:
+            use.end()
+            await self._tidy(key, use.entry)
 
     async def _tidy(self, key: ExcerptKey, entry: _Entry) -> None:
         """Remove what was not made, what is no longer wanted, and what is beyond the bound."""

@@ -196,6 +196,51 @@ async def test_while_all_places_are_in_use_others_are_asked_to_wait(
         assert made.gaussian_count == 8
 
 
+async def test_a_part_is_made_to_its_end_when_nobody_waits_any_more(
+    placed: MagicClient, server: Server
+) -> None:
+    # A worker does not stop, so that its file must not be forgotten.
+    excerpts: Excerpts = server._excerpts
+    (key, source), (other, _) = [await preview_key(server, count=count) for count in (50, 51)]
+    run = server._jobs.run
+    begun: list[str] = []
+    ended: list[str] = []
+    go = asyncio.Event()
+
+    async def held_up(function, /, *arguments):
+        begun.append(function.__name__)
+        await go.wait()
+        try:
+            return await run(function, *arguments)
+        finally:
+            ended.append(function.__name__)
+
+    async def asked(key: ExcerptKey) -> int:
+        async with excerpts.opened(key, source) as (made, _):
+            return made.gaussian_count
+
+    async def given_up(key: ExcerptKey) -> None:
+        before = len(begun)
+        asking = asyncio.create_task(asked(key))
+        async with asyncio.timeout(60.0):
+            while len(begun) == before:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        asking.cancel()
+        await asyncio.gather(asking, return_exceptions=True)
+
+    server._jobs.run = held_up
+    await given_up(key)
+    again = asyncio.create_task(asked(key))  # waits for what is being made
+    await given_up(other)
+    await excerpts.forget(other.session)  # as when the session is deleted
+    go.set()
+    assert await again == 50
+    async with asyncio.timeout(300.0):
+        while len(ended) < 2 or folders_of(server):  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
+    assert begun == ["make_excerpt"] * 2
+
+
 async def preview_key(server: Server, *, count: int) -> tuple[ExcerptKey, object]:
     """A level of detail of the preview."""
     row = await server._store.agents.session("room")
