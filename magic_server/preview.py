@@ -24,7 +24,7 @@ from magic_core.wire import geometry, names, records
 from magic_core.wire.convert import moment
 from magic_server.coordinator import SessionCoordinator
 from magic_server.jobs import JobExecutor
-from magic_server.jobs.delivery import Deliveries, Delivery, JobFile, OpenFile
+from magic_server.jobs.delivery import Deliveries, Delivery, JobFile
 from magic_server.jobs.tasks import PlacedFiles, PreviewTask, append_submaps
 from magic_server.preview_config import PreviewConfig
 from magic_server.sending import open_chunks
@@ -90,17 +90,22 @@ class Previews:
         """Stop following."""
         await self._tasks.close()
 
+    @contextlib.asynccontextmanager
     async def stream(
         self, session: str, kind: records.MapFormat
-    ) -> tuple[records.GlobalMapInfo, str, int, AsyncIterator[submap_pb2.BlobChunk]]:
+    ) -> AsyncIterator[tuple[records.GlobalMapInfo, str, int, AsyncIterator[submap_pb2.BlobChunk]]]:
         """The last preview of a session: what it is, its SHA-256 and length, and its chunks.
 
         Made now where there is none in this format. NotFound while no sub-map is placed.
         """
         last = await self._newest(session, kind)
         made, sha256, length = last.files[kind]
-        file = await self._in_thread(self._deliveries.opened, made)
-        return last.info, sha256, length, self._chunks(last, file)
+        async with self._reading(last):
+            file = await self._in_thread(self._deliveries.opened, made)
+            try:
+                yield last.info, sha256, length, open_chunks(file, self._threads)
+            finally:
+                file.close()
 
     @contextlib.asynccontextmanager
     async def held(self, session: str) -> AsyncIterator[tuple[records.GlobalMapInfo, StreamedFile]]:
@@ -234,16 +239,6 @@ class Previews:
             preview.readers -= 1
             if preview.replaced and not preview.readers:
                 await asyncio.shield(self._in_thread(preview.delivery.clear))
-
-    async def _chunks(
-        self, preview: _Preview, file: OpenFile
-    ) -> AsyncIterator[submap_pb2.BlobChunk]:
-        try:
-            async with self._reading(preview):
-                async for chunk in open_chunks(file, self._threads):
-                    yield chunk
-        finally:
-            file.close()
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

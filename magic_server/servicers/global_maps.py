@@ -115,14 +115,26 @@ class GlobalMapServicer(map_grpc.GlobalMapServiceServicer):
                 async with self._of_stored(session, kind, part, *found) as download:
                     yield download
                 return
-        async with self._previews.held(session) as (info, source):
-            if not part.is_whole(info):
-                row = await self._store.agents.session(session)
-                async with self._excerpt(info, source, part.key(row.id, source, kind)) as download:
-                    yield download
-                return
-        info, sha256, length, chunks = await self._previews.stream(session, kind)
-        yield part.header(info, sha256=sha256, length=length), chunks
+        async with self._of_preview(session, kind, part) as download:
+            yield download
+
+    @contextlib.asynccontextmanager
+    async def _of_preview(
+        self, session: str, kind: records.MapFormat, part: _Part
+    ) -> AsyncIterator[_Download]:
+        """The preview, or a part of it."""
+        while True:  # it may grow from one step to the next
+            async with self._previews.held(session) as (info, source):
+                if not part.is_whole(info):
+                    row = await self._store.agents.session(session)
+                    key = part.key(row.id, source, kind)
+                    async with self._excerpt(info, source, key) as download:
+                        yield download
+                    return
+            async with self._previews.stream(session, kind) as (info, sha256, length, chunks):
+                if part.is_whole(info):
+                    yield part.header(info, sha256=sha256, length=length), chunks
+                    return
 
     @contextlib.asynccontextmanager
     async def _of_stored(
