@@ -79,8 +79,9 @@ class DescriptorIndex:
             raise AlreadyExists(f"descriptor {held[0]!r} is in the index already; remove it first")
         if len({place.name for place in places}) < len(places):
             raise AlreadyExists("descriptors under one name twice")
-        for first in range(0, len(places), LOADED_AT_ONCE):
-            self._store(places[first : first + LOADED_AT_ONCE])
+        step = max(1, LOADED_AT_ONCE // max((1 + len(p.keyframes) for p in places), default=1))
+        for first in range(0, len(places), step):
+            self._store(places[first : first + step])
             if self._is_exact and self.vectors > self._exact_limit:
                 self._become_inverted_file()
 

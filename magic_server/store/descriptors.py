@@ -33,6 +33,8 @@ CANDIDATES = 8
 LEAST_CANDIDATES = 200
 _MOST_CANDIDATES = 1000  # of hnsw.ef_search
 _BATCH = 500
+_Vector = tuple[str, int, ArrayLike]
+"""The name of a sub-map, a place among its keyframes (0: the anchor) and that one's descriptor."""
 
 
 class DescriptorTable:
@@ -115,14 +117,15 @@ class PgvectorPlaces:
                 names.submap_name(self._session.name, r.name, r.number): r.vectors for r in rows
             }
         missing = [one for one in places if held_of.get(one.name, 0) < 1 + len(one.keyframes)]
-        for begin in range(0, len(missing), _BATCH):
+        vectors = _vectors_of(missing)
+        for begin in range(0, len(vectors), _BATCH):
             async with self._database.write(self._session.id) as connection:
-                await self._insert(connection, missing[begin : begin + _BATCH])
+                await self._insert(connection, vectors[begin : begin + _BATCH])
 
     async def add(self, place: Place) -> None:
         """Hold one more; nothing happens when it is there."""
         async with self._database.write(self._session.id) as connection:
-            await self._insert(connection, [place])
+            await self._insert(connection, _vectors_of([place]))
 
     async def remove(self, names: Collection[str]) -> None:
         """Nothing to do: descriptors go with the rows of their sub-maps."""
@@ -176,7 +179,7 @@ class PgvectorPlaces:
             for name, row in zip(found, rows, strict=True)
         ]
 
-    async def _insert(self, connection: AsyncConnection, places: Sequence[Place]) -> None:
+    async def _insert(self, connection: AsyncConnection, found: Sequence[_Vector]) -> None:
         d = self._session.dimension
         statement = sa.text(
             f"INSERT INTO {self._table} (submap_id, session_id, keyframe, embedding) "
@@ -189,14 +192,21 @@ class PgvectorPlaces:
             "ON CONFLICT DO NOTHING"
         )
         rows = [
-            (*names.parse_submap(place.name)[1:], keyframe, _text(vector, d))
-            for place in places
-            for keyframe, vector in ((0, place.vector), *place.keyframes)
+            (*names.parse_submap(name)[1:], keyframe, _text(vector, d))
+            for name, keyframe, vector in found
         ]
         agents, numbers, keyframes, vectors = map(list, zip(*rows, strict=True))
         values = {"session": self._session.id, "agents": agents, "numbers": numbers}
         values |= {"keyframes": keyframes, "vectors": vectors}
         await connection.execute(statement, values)
+
+
+def _vectors_of(places: Sequence[Place]) -> list[_Vector]:
+    return [
+        (place.name, keyframe, vector)
+        for place in places
+        for keyframe, vector in ((0, place.vector), *place.keyframes)
+    ]
 
 
 def _table(dimension: int) -> str:
