@@ -1,8 +1,9 @@
 """Merging block by block: a job that plans, jobs for each block, a job that joins them.
 
 Each block is refined twice, by itself and then shortly beside its refined neighbours, and has a
-folder for each. After a restart of the server the jobs of blocks that were done find them done, and
-one that was begun goes on from its last checkpoint.
+folder for each. After a restart of the server the jobs of blocks that were done find them done; one
+that was begun goes on from its last checkpoint in the first round, and begins anew in the second.
+Where jobs leave their files in a bucket, which keeps no folders, all of it begins anew.
 """
 
 from __future__ import annotations
