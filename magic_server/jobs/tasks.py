@@ -305,6 +305,7 @@ def _view(stored: StoredSubmap, keyframe: int, config: RegistrationConfig) -> An
         others = sorted(set(np.rint(spread).astype(int).tolist()))
     if keyframe:  # in front: the coarse methods on points see the first images only
         others = [keyframe, *(other for other in others if other != keyframe)]
+        others = others[: config.max_keyframes]  # one more would be decoded for nothing
     colour, depth = _images(header, stored, 0)
     keyframes = []
     for index in others:
