@@ -27,7 +27,7 @@ _MOST_PER_ROUND = 0.25  # of all Gaussians that are merged away before neighbour
 _LEAST_PER_ROUND = 0.0625  # of all pairs, so that no cloud takes a round for each Gaussian
 _MAX_OPACITY = 0.999
 _MOST_SURPLUS = 2.0  # two opaque Gaussians in one place
-_MIN_SCALE_M = 1e-9
+_MIN_SCALE_M, _MAX_SCALE_M = 1e-9, float(np.finfo(np.float32).max)
 _LEAST_WEIGHT = 1e-30  # of what shows nothing, so that a mean of two such is one all the same
 
 
@@ -154,7 +154,7 @@ def _gaussians(moments: _Moments) -> GaussianCloud:
     return GaussianCloud.from_arrays(
         moments.means,
         Rotation.from_matrix(axes).as_quat(scalar_first=True),
-        scales=np.maximum(np.sqrt(np.maximum(variances, 0.0)), _MIN_SCALE_M),
+        scales=np.clip(np.sqrt(np.maximum(variances, 0.0)), _MIN_SCALE_M, _MAX_SCALE_M),
         opacities=np.minimum(moments.weights / areas, _MAX_OPACITY),
         colours=moments.colours,
     )

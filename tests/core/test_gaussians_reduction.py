@@ -97,7 +97,7 @@ def test_extreme_clouds_become_valid_ones(count):
     cloud = GaussianCloud.from_arrays(
         np.repeat(rng.choice([-1e6, 0.0, 1e6], (30, 3)), 2, axis=0),
         quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
-        scales=rng.choice([1e-12, 1e-3, 1e6], (60, 3)),
+        scales=rng.choice([1e-12, 1e-3, 1e6, 3e38], (60, 3)),
         opacities=rng.choice([0.0, 0.5, 1.0], 60),
         colours=rng.choice([-1.0, 0.0, 2.0], (60, 3)),
     )
