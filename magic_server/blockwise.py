@@ -33,8 +33,8 @@ from magic_server.jobs.delivery import Deliveries, Delivery, Progress
 from magic_server.jobs.tasks import MergeOutcome, MergeTask
 from magic_server.store.blob_store import StreamedFile
 
-_REFINED = 0.8
-"""Share of the progress that the first round takes."""
+_PLANNED, _REFINED = 0.05, 0.8
+"""Share of the progress when space is divided, and when the first round is over."""
 
 
 def is_blockwise(task: MergeTask) -> bool:
@@ -62,6 +62,7 @@ class BlockwiseMerge:
         self._task, self._folder = task, folder
         self._jobs, self._deliveries = jobs, deliveries
         self._turn = asyncio.Semaphore(at_once)
+        self._planning = deliveries.of(folder / "plan")
         self._begun: dict[int, Delivery] = {}
         self._round = "dividing space into blocks"
         self._before, self._share, self._done, self._count = 0.0, 0.0, 0, 0
@@ -69,11 +70,10 @@ class BlockwiseMerge:
 
     async def run(self) -> MergeOutcome:
         """The merged map; the first error of any job ends all."""
-        planning = self._deliveries.of(self._folder / "plan")
-        plan = PlanTask(self._task.submaps, self._task.config, planning)
+        plan = PlanTask(self._task.submaps, self._task.config, self._planning)
         planned = await self._jobs.run(plan_merge, plan)
         tasks = [self._block_task(block, f"block-{i:04d}") for i, block in enumerate(planned)]
-        self._begin_round("refining", len(planned), before=0.0, share=_REFINED)
+        self._begin_round("refining", len(planned), before=_PLANNED, share=_REFINED - _PLANNED)
         files = await self._each(refine_block, [(task, task.delivery) for task in tasks])
 
         blocks = [task.block for task in tasks]
@@ -140,4 +140,6 @@ class BlockwiseMerge:
             share = self._before + self._share * min(1.0, done / self._count)
             self._told = max(self._told, share)
             stage = f"{self._round}, {self._done} of {self._count} blocks done"
+        elif (planned := self._planning.progress()) is not None:
+            self._told = max(self._told, _PLANNED * planned[0])
         return self._told, "; ".join([stage, *stages])
