@@ -206,9 +206,10 @@ async def _insert(connection: AsyncConnection, arrival: Arrival) -> None:
 
 
 def _is(session: SessionRow, agent: str, index: int) -> sa.ColumnElement[bool]:
-    return sa.and_(
-        submaps.c.session_id == session.id, agents.c.name == agent, submaps.c.number == index
-    )
+    # The agent's row first: through the session every sub-map of it would be looked at.
+    mine = sa.and_(agents.c.session_id == session.id, agents.c.name == agent)
+    row = sa.select(agents.c.id).where(mine).correlate(None).scalar_subquery()
+    return sa.and_(submaps.c.agent_id == row, submaps.c.number == index)
 
 
 def submap_columns(session_id: int, agent_id: int, submap: NewSubmap) -> dict[str, object]:
