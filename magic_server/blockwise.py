@@ -15,7 +15,7 @@ from typing import Any
 
 from magicslam.v1 import submap_pb2
 
-from magic_server.globalmap.blocks import blocks_near
+from magic_server.globalmap.blocks import REFINED, blocks_near
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.blockwise import (
     BlockOutcome,
@@ -33,8 +33,8 @@ from magic_server.jobs.delivery import Deliveries, Delivery, Progress
 from magic_server.jobs.tasks import MergeOutcome, MergeTask
 from magic_server.store.blob_store import StreamedFile
 
-_PLANNED, _REFINED = 0.05, 0.8
-"""Share of the progress when space is divided, and when the first round is over."""
+_PLANNED = 0.05
+"""Share of the progress when space is divided."""
 
 
 def is_blockwise(task: MergeTask) -> bool:
@@ -73,7 +73,7 @@ class BlockwiseMerge:
         plan = PlanTask(self._task.submaps, self._task.config, self._planning)
         planned = await self._jobs.run(plan_merge, plan)
         tasks = [self._block_task(block, f"block-{i:04d}") for i, block in enumerate(planned)]
-        self._begin_round("refining", len(planned), before=_PLANNED, share=_REFINED - _PLANNED)
+        self._begin_round("refining", len(planned), before=_PLANNED, share=REFINED - _PLANNED)
         files = await self._each(refine_block, [(task, task.delivery) for task in tasks])
 
         blocks = [task.block for task in tasks]
@@ -82,7 +82,7 @@ class BlockwiseMerge:
             TouchTask(task, files[i], tuple(files[other] for other in blocks_near(blocks, i)))
             for i, task in enumerate(tasks)
         ]
-        self._begin_round("refining borders", len(planned), before=_REFINED, share=1.0 - _REFINED)
+        self._begin_round("refining borders", len(planned), before=REFINED, share=1.0 - REFINED)
         files = await self._each(touch_up_block, [(task, task.block.delivery) for task in touching])
         self._round = "joining blocks"
         joining = JoinTask(tuple(files), self._deliveries.of(self._folder / "join"))

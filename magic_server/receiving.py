@@ -27,8 +27,7 @@ from magic_core.errors import (
     Unavailable,
     WrongState,
 )
-from magic_core.wire import check_blob, check_chunk, check_header, geometry, names
-from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
+from magic_core.wire import check_blob, check_chunk, check_header, names
 from magic_server.config import ServiceLimits
 from magic_server.quotas import Quotas
 from magic_server.store import (
@@ -341,28 +340,12 @@ class Upload:
 
     def new_submap(self) -> NewSubmap:
         """Everything for the transaction."""
-        session, agent, index = names.parse_submap(self.header.name)
-        frames = self.header.trajectory
-        prior = None
-        if self.header.HasField("world_from_anchor_prior"):
-            prior = geometry.pose_from_proto(self.header.world_from_anchor_prior)
-        vertex = Vertex(
-            name=self.header.name,
-            agent=names.agent_name(session, agent),
-            index=index,
-            descriptor=geometry.descriptor_from_proto(self.header.image_descriptor),
-            odometry=decode_odometry(self.header),
-            prior=prior,
-            searched=False,
-            span_s=(frames[0].timestamp_s, frames[-1].timestamp_s),
-            keyframes=decode_keyframe_descriptors(self.header),
-        )
         return NewSubmap(
             header=self.header,
             header_sha256=self._digest,
             gaussian_count=self._gaussian_count,
             digests=tuple(blob.sha256.hex() for blob in self.header.blobs),
-            vertex=vertex,
+            vertex=Vertex.of(self.header),
         )
 
     def _begin(self, name: UploadName) -> None:

@@ -9,8 +9,8 @@ from magicslam.v1 import mapping_service_pb2 as mapping_pb
 from magicslam.v1 import submap_pb2
 from numpy.typing import NDArray
 
-from magic_core.geometry.seams import Seams, seams_between
-from magic_core.submap import OdometryEdge, TrackedFrame
+from magic_core.geometry.seams import Seams, even_shares, seams_between
+from magic_core.submap import OdometryEdge
 from magic_core.wire import geometry, names
 
 Pose = NDArray[np.float64]
@@ -41,9 +41,7 @@ def seams_of_anchors(
     return seams_between(anchors, odometry)
 
 
-def shares_of(
-    trajectory: Iterable[TrackedFrame] | Iterable[submap_pb2.TrackedFrame],
-) -> dict[int, float]:
+def shares_of(trajectory: Iterable[submap_pb2.TrackedFrame]) -> dict[int, float]:
     """How far along its sub-map each frame is, by frame index: 0 at the anchor, 1 at the next."""
     indices = [frame.frame_index for frame in trajectory]
-    return {index: place / len(indices) for place, index in enumerate(indices)}
+    return dict(zip(indices, even_shares(len(indices)).tolist(), strict=True))

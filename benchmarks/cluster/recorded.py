@@ -27,7 +27,6 @@ from magicslam.v1 import submap_pb2
 
 from magic_core.evaluation import RunFolder
 from magic_core.wire import geometry, names
-from magic_core.wire.submap import decode_odometry
 from magic_server.store import AgentRow, Asked, NewSubmap, SessionRow, Store, Vertex
 from magic_server.store.submaps import Arrival
 
@@ -124,19 +123,8 @@ class Filling:
             header.odometry.information.extend(geometry.information_to_list(np.eye(6)))
         for blob in header.blobs:  # no two sub-maps have the same ones
             blob.sha256 = self._generator.bytes(32)
-        frames = header.trajectory
-        vertex = Vertex(
-            name=header.name,
-            agent=names.agent_name(agent.session.name, agent.name),
-            index=index,
-            descriptor=geometry.descriptor_from_proto(header.image_descriptor),
-            odometry=decode_odometry(header),
-            prior=None,
-            searched=False,
-            span_s=(frames[0].timestamp_s, frames[-1].timestamp_s),
-        )
         digests = tuple(blob.sha256.hex() for blob in header.blobs)
-        return NewSubmap(header, self._generator.bytes(32), 50_000, digests, vertex)
+        return NewSubmap(header, self._generator.bytes(32), 50_000, digests, Vertex.of(header))
 
 
 async def measure(filling: Filling, store: Store, size: int, database: Path) -> dict:

@@ -59,7 +59,7 @@ class SubmapView:
 
     def spread(self, seams: Seams) -> NDArray[np.float64]:
         """(n, 4, 4) anchor_from_camera of its frames, with what its seams ask of them."""
-        return seams.spread(self.path, np.arange(len(self.path)) / len(self.path))
+        return seams.spread(self.path)
 
 
 @dataclass(slots=True)

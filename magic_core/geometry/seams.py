@@ -55,13 +55,16 @@ class Seams:
             end = behind[1], se3.log(se3.inverse(anchor @ behind[1]) @ behind[0])
         return cls(start, end)
 
-    def spread(self, anchor_from_cameras: ArrayLike, shares: ArrayLike) -> NDArray[np.float64]:
+    def spread(
+        self, anchor_from_cameras: ArrayLike, shares: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
         """Move frames (n, 4, 4), each at its share of the sub-map: 0 at its anchor, 1 at the next.
 
+        Without `shares` they are all its frames in order, which lie evenly between the anchors.
         Raises ValueError where there is not one share for each frame.
         """
         frames = np.array(anchor_from_cameras, np.float64).reshape(-1, 4, 4)
-        share = np.asarray(shares, np.float64)
+        share = np.asarray(even_shares(len(frames)) if shares is None else shares, np.float64)
         if share.shape != frames.shape[:1]:
             raise ValueError(f"{len(frames)} frames, but shares of shape {share.shape}")
         if self.start is not None:
@@ -73,6 +76,11 @@ class Seams:
             moved = seam @ se3.fractions(twist, share[late] - 0.5) @ se3.inverse(seam)
             frames[late] = moved @ frames[late]
         return frames
+
+
+def even_shares(count: int) -> NDArray[np.float64]:
+    """(count,) how far along its sub-map each frame is: 0 at the anchor, 1 at the next one."""
+    return np.arange(count) / max(count, 1)
 
 
 NO_SEAMS = Seams()

@@ -13,7 +13,6 @@ from magicslam.v1 import session_service_pb2 as session_pb
 from magic_core.errors import CorruptData, InvalidInput, MagicError
 from magic_core.wire import SubmapLimits, check_blob, check_header, convert, geometry, names
 from magic_core.wire.header_check import request_id_problem
-from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
 from magic_server.store import ImportedSubmap, NewSubmap, Vertex, WrittenBlob, require_model
 from magic_server.store.rows import SessionRow
 
@@ -118,32 +117,18 @@ def _submap(
     header = entry.header
     check_header(header, limits)
     _check_time(entry.received_at)
-    _, agent, index = names.parse_submap(header.name)
+    _, agent, _ = names.parse_submap(header.name)
     require_model(session, header.image_descriptor.model_id, len(header.image_descriptor.vector))
     if header.HasField("odometry"):
         previous = (agent, header.odometry.previous_index)
         _require(previous in numbers, "odometry.previous_index", "is not in the archive")
     count = sum(_checked_blob(header, number, blobs) for number in range(len(header.blobs)))
-    prior = None
-    if header.HasField("world_from_anchor_prior"):
-        prior = geometry.pose_from_proto(header.world_from_anchor_prior)
-    vertex = Vertex(
-        name=header.name,
-        agent=names.agent_name(session.name, agent),
-        index=index,
-        descriptor=geometry.descriptor_from_proto(header.image_descriptor),
-        odometry=decode_odometry(header),
-        prior=prior,
-        searched=entry.searched,
-        span_s=(header.trajectory[0].timestamp_s, header.trajectory[-1].timestamp_s),
-        keyframes=decode_keyframe_descriptors(header),
-    )
     submap = NewSubmap(
         header=header,
         header_sha256=hashlib.sha256(header.SerializeToString(deterministic=True)).digest(),
         gaussian_count=count,
         digests=tuple(blob.sha256.hex() for blob in header.blobs),
-        vertex=vertex,
+        vertex=Vertex.of(header, searched=entry.searched),
     )
     received_at = convert.timestamp_from_proto(entry.received_at).timestamp()
     return ImportedSubmap(agent, submap, received_at, entry.searched)

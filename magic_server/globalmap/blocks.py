@@ -24,6 +24,9 @@ _GUEST_SHARE = 0.2  # of a keyframe's samples inside a box, for it to teach the 
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
 
+REFINED = 0.8
+"""Share of a merge's progress when each block has been refined by itself."""
+
 
 @dataclass(frozen=True, slots=True)
 class ViewPlace:

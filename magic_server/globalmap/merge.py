@@ -21,7 +21,7 @@ from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.morton import in_morton_order
 from magic_core.render import LossWeights
 from magic_core.render.backend import Optimiser, new_optimiser
-from magic_server.globalmap.blocks import Block, blocks_near, places_of, plan_blocks
+from magic_server.globalmap.blocks import REFINED, Block, blocks_near, places_of, plan_blocks
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.parts import Parts, fingerprint_of
 from magic_server.globalmap.placement import (
@@ -38,8 +38,6 @@ Progress = Callable[[float, str], None]
 _TOUCHED = 0.4
 """Share of the schedule, its last, that a block goes through once more beside refined neighbours:
 0.2 gains 0.03 dB at the borders, 0.4 0.24 dB (benchmarks/results/global-map.md)."""
-REFINED = 0.8
-"""Share of the progress when each block has been refined by itself."""
 _JUDGED_VIEWS = 24  # keyframes of a block on which the merge reports its own quality
 
 
@@ -195,10 +193,9 @@ def refine_block(
         done=done,
     )
     result = stage.run()
-    after = mean_psnr(optimiser, judged)
-    refined = optimiser.gaussians()
-    refined = refined.select(block.holds(refined.means))
-    figures = _figures(refined, result, coarse=own, psnr=(before, after), views=len(views))
+    psnr = (before, mean_psnr(optimiser, judged))
+    refined = _own_of(block, optimiser)
+    figures = _figures(refined, result, coarse=own, psnr=psnr, views=len(views))
     parts.finish(number, refined, figures)
     return figures
 
@@ -231,12 +228,17 @@ def touch_up(
     stage = FineStage(optimiser, views, config, progress=progress, done=begun)
     result = stage.run()
     result = dataclasses.replace(result, iterations=result.iterations - begun)
-    after = mean_psnr(optimiser, _spread(views, _JUDGED_VIEWS))
-    refined = optimiser.gaussians()
-    refined = refined.select(block.holds(refined.means))
-    figures = _figures(refined, result, coarse=len(own), psnr=(None, after), views=len(views))
+    psnr = (None, mean_psnr(optimiser, _spread(views, _JUDGED_VIEWS)))
+    refined = _own_of(block, optimiser)
+    figures = _figures(refined, result, coarse=len(own), psnr=psnr, views=len(views))
     parts.finish(number, refined, figures)
     return figures
+
+
+def _own_of(block: Block, optimiser: Optimiser) -> GaussianCloud:
+    """What is kept of a refined block: its neighbours keep the rest."""
+    refined = optimiser.gaussians()
+    return refined.select(block.holds(refined.means))
 
 
 def _coarse_of(block: Block, sources: Sequence[PlacedSource]) -> tuple[GaussianCloud, int]:

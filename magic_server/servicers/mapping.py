@@ -24,7 +24,7 @@ from magic_server.coordinator import SessionCoordinator
 from magic_server.localizing import Localizer
 from magic_server.quotas import Quotas
 from magic_server.receiving import SubmapReceiver
-from magic_server.seams import seams_of, shares_of
+from magic_server.seams import seams_of
 from magic_server.servicers.fields import check_request_id, page_limit, page_start, token_of
 from magic_server.sessions import Sessions
 from magic_server.store import Asked, Store, require_model
@@ -266,9 +266,7 @@ def _trajectory_part(
     """The corrected frames of one sub-map, with what its seams ask of them."""
     world_from_anchor = geometry.pose_from_proto(pose.world_from_anchor)
     tracked = decode_trajectory(submap_pb2.SubmapHeader.FromString(header))
-    anchor_from_cameras = seams.spread(
-        [frame.anchor_from_camera for frame in tracked], list(shares_of(tracked).values())
-    )
+    anchor_from_cameras = seams.spread([frame.anchor_from_camera for frame in tracked])
     frames = tuple(
         records.CorrectedFrame(frame.frame_index, frame.timestamp_s, camera, frame.lost)
         for frame, camera in zip(tracked, world_from_anchor @ anchor_from_cameras, strict=True)

@@ -10,6 +10,8 @@ from magicslam.v1 import submap_pb2
 from numpy.typing import ArrayLike, NDArray
 
 from magic_core.submap import Descriptor, OdometryEdge
+from magic_core.wire import geometry, names
+from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
 from magic_server.store.blob_store import StoredBlob
 
 DescribedKeyframe = tuple[int, NDArray[np.float32]]
@@ -59,6 +61,26 @@ class Vertex(GraphVertex):
     """Whether loop candidates were looked for."""
     keyframes: tuple[DescribedKeyframe, ...] = ()
     """Those that have a descriptor of their own."""
+
+    @classmethod
+    def of(cls, header: submap_pb2.SubmapHeader, *, searched: bool = False) -> Vertex:
+        """From a checked header."""
+        session, agent, index = names.parse_submap(header.name)
+        prior = None
+        if header.HasField("world_from_anchor_prior"):
+            prior = geometry.pose_from_proto(header.world_from_anchor_prior)
+        frames = header.trajectory
+        return cls(
+            name=header.name,
+            agent=names.agent_name(session, agent),
+            index=index,
+            descriptor=geometry.descriptor_from_proto(header.image_descriptor),
+            odometry=decode_odometry(header),
+            prior=prior,
+            searched=searched,
+            span_s=(frames[0].timestamp_s, frames[-1].timestamp_s),
+            keyframes=decode_keyframe_descriptors(header),
+        )
 
     def bare(self) -> GraphVertex:
         """Without what it is found by."""

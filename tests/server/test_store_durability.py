@@ -18,7 +18,6 @@ import pytest
 from magic_core.errors import CorruptData, NotFound, ResourceExhausted, WrongState
 from magic_core.submap import Submap
 from magic_core.wire import encode_submap
-from magic_core.wire.submap import decode_keyframe_descriptors, decode_odometry
 from magic_server.store import Asked, BlobFolder, BlobWriter, NewSubmap, Store, Vertex
 from magic_server.store.blobs import translated_disk_errors
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
@@ -43,19 +42,10 @@ def written(folder: BlobFolder, data: bytes) -> BlobWriter:
 def new_submap(submap: Submap, store: Store) -> tuple[NewSubmap, list[BlobWriter]]:
     encoded = encode_submap(submap, request_id="r")
     blobs = [written(store.blobs, blob) for blob in encoded.blobs]
-    vertex = Vertex(
-        name=submap.name,
-        agent=f"sessions/{submap.session}/agents/{submap.agent}",
-        index=submap.index,
-        descriptor=submap.descriptor,
-        odometry=decode_odometry(encoded.header),
-        prior=None,
-        searched=False,
-        span_s=(submap.trajectory[0].timestamp_s, submap.trajectory[-1].timestamp_s),
-        keyframes=decode_keyframe_descriptors(encoded.header),
-    )
     digests = tuple(blob.sha256 for blob in blobs)
-    return NewSubmap(encoded.header, bytes(32), len(submap.gaussians), digests, vertex), blobs
+    return NewSubmap(
+        encoded.header, bytes(32), len(submap.gaussians), digests, Vertex.of(encoded.header)
+    ), blobs
 
 
 async def registered(store: Store, agent: str = "agent_0"):
