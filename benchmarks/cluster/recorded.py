@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import resource
 import tempfile
 import time
 import uuid
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from magicslam.v1 import submap_pb2
+from scale import rss_mib, spread
 
 from magic_core.evaluation import RunFolder
 from magic_core.wire import geometry, names
@@ -35,17 +35,6 @@ TOGETHER = 500
 """Sub-maps of one transaction while the database is filled."""
 SINGLE = 200
 """Sub-maps, headers and pages that are timed at each size."""
-
-
-def rss_mib() -> float:
-    """The most memory that this process has had."""
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
-
-
-def spread(seconds: list[float]) -> dict[str, float]:
-    """p50, p99 and the largest in milliseconds."""
-    found = np.percentile(1e3 * np.array(seconds), (50, 99, 100)).round(2).tolist()
-    return dict(zip(("p50", "p99", "max"), found, strict=True))
 
 
 def database_mb(folder: Path) -> float:

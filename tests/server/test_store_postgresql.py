@@ -311,14 +311,19 @@ def differences(connection: sa.Connection) -> list:
     return [one for one in found if "alembic_version" not in str(one)]
 
 
+def put_old_session(connection: sa.Connection) -> None:
+    """A session, in tables of any age."""
+    connection.execute(sa.insert(schema.schema_version), {"version": 1})
+    row = {"name": "old", "created_at": 1.0, "model_id": MODEL_ID, "dimension": DIMENSION}
+    connection.execute(sa.insert(schema.sessions), row)
+
+
 def before_the_revisions(connection: sa.Connection) -> None:
     """The tables as builds without revisions made them."""
     new = {"leases", "identity", "imports"}
     tables = [table for table in schema.metadata.sorted_tables if table.name not in new]
     schema.metadata.create_all(connection, tables=tables)
-    connection.execute(sa.insert(schema.schema_version), {"version": 1})
-    row = {"name": "old", "created_at": 1.0, "model_id": MODEL_ID, "dimension": DIMENSION}
-    connection.execute(sa.insert(schema.sessions), row)
+    put_old_session(connection)
 
 
 async def test_an_older_database_gets_the_tables_that_are_missing(
@@ -345,9 +350,7 @@ def revision_3(connection: sa.Connection) -> None:
         connection.execute(sa.text(f"ALTER TABLE {table} DROP COLUMN {column}"))
     connection.execute(sa.text("CREATE TABLE alembic_version (version_num VARCHAR(32))"))
     connection.execute(sa.text("INSERT INTO alembic_version VALUES ('0003')"))
-    connection.execute(sa.insert(schema.schema_version), {"version": 1})
-    row = {"name": "old", "created_at": 1.0, "model_id": MODEL_ID, "dimension": DIMENSION}
-    connection.execute(sa.insert(schema.sessions), row)
+    put_old_session(connection)
     connection.execute(sa.text(OLD_LOOP))
 
 
