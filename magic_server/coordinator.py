@@ -89,18 +89,20 @@ class SessionCoordinator:
 
     async def start(self) -> None:
         """Rebuild everything from the store and begin to work."""
-        vertices = await self._store.submaps.vertices(self.session)
-        for vertex in vertices:
-            self.graph.add_vertex(vertex)
-            if not vertex.searched:
-                self._arrived.append(vertex)
-        await self._places.load([_place(vertex) for vertex in vertices if vertex.searched])
+        await self._places.open()
+        async for vertices in self._store.submaps.pages(self.session):
+            for vertex in vertices:
+                self.graph.add_vertex(vertex)
+                if not vertex.searched:
+                    self._arrived.append(vertex)
+            await self._places.load([_place(vertex) for vertex in vertices if vertex.searched])
         for removed in await self._store.submaps.removed(self.session):
             self.graph.add_removed(removed)
-        for loop in await self._store.loops.all(self.session):
-            self.graph.set_loop(loop)
-            if loop.verdict == "PENDING":
-                self._pending.append(loop)
+        async for loops in self._store.loops.pages(self.session):
+            for loop in loops:
+                self.graph.set_loop(loop)
+                if loop.verdict == "PENDING":
+                    self._pending.append(loop)
         await self._solving.start(on_idle=self._tell_idle)
         for worker in range(self._jobs.workers):
             self._tasks.start(self._verify_for_ever(), name=f"verify {worker}", detached=True)

@@ -192,8 +192,10 @@ class SessionGraph:
         if odometry is None:
             return NewVertex(vertex.name, None, prior, group=vertex.agent)
         session, agent, _ = names.parse_submap(vertex.name)
+        source = names.submap_name(session, agent, odometry.previous_index)
+        before = self._vertices.get(source)
         edge = Edge(
-            source=names.submap_name(session, agent, odometry.previous_index),
+            source=source if before is None else before.name,  # that very string, not its equal
             target=vertex.name,
             source_from_target=odometry.previous_from_anchor,
             information=odometry.information,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from magic_server.config import ServerConfig
+from magic_server.store import SessionRow, Store, Vertex
 from magic_server.store.bucket import BucketBlobs, bucket_of, listed
 from magic_server.store.bucket_client import BucketClient
 
@@ -31,6 +32,11 @@ def stored_previews(config: ServerConfig) -> int:
         return len(list(config.data_dir.glob("**/previews/*/*")))
     keys = [key for key, _ in listed(BucketClient(place), "") if "/previews/" in key]
     return len({key.rpartition("/")[0] for key in keys})
+
+
+async def stored_vertices(store: Store, session: SessionRow) -> list[Vertex]:
+    """Every sub-map of a session, in order of arrival."""
+    return [vertex async for page in store.submaps.pages(session) for vertex in page]
 
 
 def put_stray(blobs, sha256: str, data: bytes) -> None:

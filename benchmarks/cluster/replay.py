@@ -114,9 +114,10 @@ async def _solved(config: ServerConfig) -> dict[str, np.ndarray]:
         async with Store(config.data_dir, threads) as store:
             (session,) = await store.agents.sessions()
             graph = SessionGraph(session.name, config.posegraph)
-            for vertex in await store.submaps.vertices(session):
-                graph.add_vertex(vertex)
-            loops = await store.loops.all(session)
+            async for vertices in store.submaps.pages(session):
+                for vertex in vertices:
+                    graph.add_vertex(vertex)
+            loops = [loop async for page in store.loops.pages(session) for loop in page]
             for loop in sorted(loops, key=lambda loop: (loop.source, loop.target)):
                 graph.set_loop(loop)
             while graph.has_news:

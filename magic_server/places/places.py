@@ -16,8 +16,12 @@ from magic_server.places.index import DescriptorIndex
 class Places(Protocol):
     """The descriptors of one session's sub-maps."""
 
+    async def open(self) -> None:
+        """Be ready for everything else."""
+        ...
+
     async def load(self, places: Sequence[Place]) -> None:
-        """Hold these, and no others."""
+        """Hold these too; they come page by page when a session is begun."""
         ...
 
     async def add(self, place: Place) -> None:
@@ -42,8 +46,11 @@ class LocalPlaces:
         self._threads = threads
         self._lock = asyncio.Lock()
 
+    async def open(self) -> None:
+        """Nothing to do."""
+
     async def load(self, places: Sequence[Place]) -> None:
-        """Hold these, and no others; the index must be new."""
+        """Hold these too; AlreadyExists when one is there."""
         async with self._lock:
             await self._in_thread(self._index.load, places)
 

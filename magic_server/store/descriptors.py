@@ -103,19 +103,13 @@ class PgvectorPlaces:
         self._session = session
         self._table = _table(session.dimension)
 
-    async def load(self, places: Sequence[Place]) -> None:
-        """Hold these; what the table has already is left as it is."""
+    async def open(self) -> None:
+        """Make the table where it is missing."""
         await self._tables.prepare(self._session.dimension)
-        held = sa.text(
-            f"SELECT a.name, m.number, count(*) AS vectors FROM {self._table} d "
-            "JOIN submaps m ON m.id = d.submap_id JOIN agents a ON a.id = m.agent_id "
-            "WHERE d.session_id = :session GROUP BY a.name, m.number"
-        )
-        async with self._database.read() as connection:
-            rows = await connection.execute(held, {"session": self._session.id})
-            held_of = {
-                names.submap_name(self._session.name, r.name, r.number): r.vectors for r in rows
-            }
+
+    async def load(self, places: Sequence[Place]) -> None:
+        """Hold these too; what the table has already is left as it is."""
+        held_of = await self._held(places)
         missing = [one for one in places if held_of.get(one.name, 0) < 1 + len(one.keyframes)]
         vectors = _vectors_of(missing)
         for begin in range(0, len(vectors), _BATCH):
@@ -143,6 +137,23 @@ class PgvectorPlaces:
                 for hit in await self._of_one(connection, query, vector, count)
             ]
         return best_of_each(found, count)
+
+    async def _held(self, places: Sequence[Place]) -> dict[str, int]:
+        """Of some sub-maps, those in the table with the number of their vectors."""
+        held = sa.text(
+            "SELECT v.agent, v.number, count(*) AS vectors "
+            "FROM unnest(CAST(:agents AS text[]), CAST(:numbers AS bigint[])) AS v (agent, number) "
+            "JOIN agents a ON a.session_id = :session AND a.name = v.agent "
+            "JOIN submaps m ON m.agent_id = a.id AND m.number = v.number "
+            f"JOIN {self._table} d ON d.submap_id = m.id GROUP BY v.agent, v.number"
+        )
+        wanted = [names.parse_submap(place.name)[1:] for place in places]
+        values = {"agents": [agent for agent, _ in wanted], "session": self._session.id}
+        values |= {"numbers": [number for _, number in wanted]}
+        async with self._database.read() as connection:
+            rows = await connection.execute(held, values)
+            name = self._session.name
+            return {names.submap_name(name, r.agent, r.number): r.vectors for r in rows}
 
     async def _of_one(
         self, connection: AsyncConnection, query: int, vector: np.ndarray, count: int

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from dataclasses import dataclass
 
 import sqlalchemy as sa
@@ -11,6 +11,9 @@ from magic_core.wire import names, records
 from magic_server.store.database import Database
 from magic_server.store.rows import SessionRow, pack, unpack
 from magic_server.store.schema import agents, loops, snapshot_changes, snapshots, submaps
+
+READ_AT_ONCE = 2000
+"""Candidates in memory at a time while a session is gone through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,22 +61,22 @@ class LoopTable:
             )
             await connection.execute(change.values(loop_columns(loop)))
 
-    async def all(self, session: SessionRow) -> list[records.LoopCandidate]:
-        """Every candidate of a session, oldest first."""
-        found, _ = await self.page(session, limit=None)
-        return found
+    async def pages(self, session: SessionRow) -> AsyncIterator[list[records.LoopCandidate]]:
+        """Every candidate of a session, oldest first, some at a time."""
+        after: int | None = 0
+        while after is not None:
+            found, after = await self.page(session, after=after, limit=READ_AT_ONCE)
+            yield found
 
     async def page(
-        self, session: SessionRow, *, after: int = 0, limit: int | None = 500
+        self, session: SessionRow, *, after: int = 0, limit: int = 500
     ) -> tuple[list[records.LoopCandidate], int | None]:
         """Candidates behind row id `after`, and where the next page begins."""
         query = sa.select(loops).where(loops.c.session_id == session.id, loops.c.id > after)
-        query = query.order_by(loops.c.id)
-        if limit is not None:
-            query = query.limit(limit + 1)
+        query = query.order_by(loops.c.id).limit(limit + 1)
         async with self._database.read() as connection:
             rows = (await connection.execute(query)).all()
-        following = rows[limit - 1].id if limit is not None and len(rows) > limit else None
+        following = rows[limit - 1].id if len(rows) > limit else None
         return [loop_record(row) for row in rows[:limit]], following
 
     async def kept(self, session: SessionRow) -> list[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -72,7 +73,7 @@ class Vertex(GraphVertex):
         frames = header.trajectory
         return cls(
             name=header.name,
-            agent=names.agent_name(session, agent),
+            agent=sys.intern(names.agent_name(session, agent)),  # many have the same
             index=index,
             descriptor=geometry.descriptor_from_proto(header.image_descriptor),
             odometry=decode_odometry(header),
@@ -135,7 +136,8 @@ def unpack(data: bytes | None, side: int) -> NDArray[np.float64] | None:
     """The (side, side) matrix of its bytes."""
     if data is None:
         return None
-    return np.frombuffer(data, "<f8").astype(np.float64).reshape(side, side)
+    # Shaped first: the copy is then one array, not one and a view of it.
+    return np.frombuffer(data, "<f8").reshape(side, side).astype(np.float64)
 
 
 def pack_keyframes(keyframes: Sequence[DescribedKeyframe]) -> bytes | None:

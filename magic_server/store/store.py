@@ -13,6 +13,7 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -49,6 +50,8 @@ logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 BUCKET_THREADS = 8
 """Requests to a bucket that the server waits for at a time; each may be for many blobs."""
+LOOKED_UP_AT_ONCE = 1000
+"""Blobs in memory at a time while those that nothing refers to are looked for."""
 
 
 class Store:
@@ -247,18 +250,20 @@ class Store:
 
     async def _collect(self, shard: str) -> int:
         async with self._commit_lock.alone():
-            used: set[str] = set()
-            async with self._database.read() as connection:
-                for digest in (submap_blobs.c.sha256, map_files.c.sha256):
-                    query = sa.select(digest).distinct().where(digest.startswith(shard))
-                    used |= set(await connection.scalars(query))
+            names, removed = self.blobs.names(shard), 0
+            while some := await self._in_thread(lambda: list(islice(names, LOOKED_UP_AT_ONCE))):
+                orphans = await self._unused(some)
+                await self._in_thread(self.blobs.remove, orphans)
+                removed += len(orphans)
+            return removed
 
-            def remove() -> int:
-                orphans = [name for name in self.blobs.names(shard) if name not in used]
-                self.blobs.remove(orphans)
-                return len(orphans)
-
-            return await self._in_thread(remove)
+    async def _unused(self, digests: Sequence[str]) -> list[str]:
+        """Those that neither a sub-map nor a map refers to."""
+        used: set[str] = set()
+        async with self._database.read() as connection:
+            for digest in (submap_blobs.c.sha256, map_files.c.sha256):
+                used |= set(await connection.scalars(sa.select(digest).where(digest.in_(digests))))
+        return [digest for digest in digests if digest not in used]
 
     async def _in_thread(self, function: Callable[..., _T], *arguments: Any) -> _T:
         return await asyncio.get_running_loop().run_in_executor(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -41,6 +42,8 @@ _SUMMARY = (
     submaps.c.stored_bytes,
     agents.c.name.label("agent"),
 )
+READ_AT_ONCE = 500
+"""Sub-maps in memory at a time while a session is gone through."""
 _VERTICES = sa.select(
     *(column for column in submaps.c if column.name != "header"), agents.c.name.label("agent")
 ).join(agents)
@@ -132,12 +135,21 @@ class SubmapTable:
             blobs = tuple(self._blobs.blob(sha256) for sha256 in found)
         return StoredSubmap(row.header, blobs)
 
-    async def vertices(self, session: SessionRow) -> list[Vertex]:
-        """Every sub-map of a session as index and pose graph need it, in order of arrival."""
-        query = _VERTICES.where(submaps.c.session_id == session.id).order_by(submaps.c.id)
-        async with self._database.read() as connection:
-            rows = (await connection.execute(query)).all()
-        return [_vertex(session, row) for row in rows]
+    async def pages(self, session: SessionRow) -> AsyncIterator[list[Vertex]]:
+        """Every sub-map of a session as index and pose graph need it, in order of arrival.
+
+        Some at a time: with their descriptors, all of them may be more than there is memory.
+        """
+        query = _VERTICES.where(submaps.c.session_id == session.id)
+        query = query.order_by(submaps.c.id).limit(READ_AT_ONCE)
+        after = 0
+        while True:
+            async with self._database.read() as connection:
+                rows = (await connection.execute(query.where(submaps.c.id > after))).all()
+            if not rows:
+                return
+            after = rows[-1].id
+            yield [_vertex(session, row) for row in rows]
 
     async def vertex(self, session: SessionRow, agent: str, index: int) -> Vertex:
         """One of them; NotFound when it is not stored."""
@@ -249,7 +261,7 @@ def _vertex(session: SessionRow, row: sa.Row) -> Vertex:
     vector = np.frombuffer(row.descriptor, "<f4").astype(np.float32)
     return Vertex(
         name=names.submap_name(session.name, row.agent, row.number),
-        agent=names.agent_name(session.name, row.agent),
+        agent=sys.intern(names.agent_name(session.name, row.agent)),
         index=row.number,
         descriptor=Descriptor(session.model_id, vector),
         odometry=_odometry(row),

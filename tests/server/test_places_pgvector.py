@@ -115,6 +115,7 @@ async def test_neighbours_are_those_of_exact_search_in_each_session(
         row = await with_submaps(store, session, vectors)
         places = store.places(row)
         assert places is not None
+        await places.open()
         await places.load(named(session, vectors))
         found[session] = places, exact(named(session, vectors))
     shares = []
@@ -138,6 +139,7 @@ async def test_it_holds_what_is_added_and_forgets_what_is_deleted(store: Store) 
     row = await with_submaps(store, "kitchen", vectors)
     places = store.places(row)
     assert places is not None
+    await places.open()
     pairs = named("kitchen", vectors)
     await places.load(pairs[:10])
     await places.add(pairs[10])
@@ -151,6 +153,7 @@ async def test_it_holds_what_is_added_and_forgets_what_is_deleted(store: Store) 
     assert len(await places.nearest(vectors[:1], 100)) == 6
     again = store.places(row)  # as another server that takes the session
     assert again is not None
+    await again.open()
     await again.load(pairs[5:])
     assert len(await again.nearest(vectors[:1], 100)) == 15
 
@@ -166,6 +169,7 @@ async def test_a_submap_is_found_once_by_the_best_of_its_views(store: Store) -> 
     ]
     index = store.places(row)
     assert index is not None
+    await index.open()
     await index.load([Place(place.name, place.vector) for place in places[:30]])
     await index.load(places[:30])  # what lacks its keyframes gets them
     for place in places[30:]:
@@ -190,6 +194,7 @@ async def test_many_views_of_one_submap_hide_no_other(
     places[0] = Place(places[0].name, vectors[0], crowd)
     index = store.places(row)
     assert index is not None
+    await index.open()
     await index.load(places)
     found = await index.nearest(vectors[:1], 4)
     assert agreement(found, exact(places).query(vectors[:1], 4)) == 1.0
@@ -202,6 +207,7 @@ async def test_a_table_of_the_build_before_takes_keyframes_after_its_revision(
     row = await with_submaps(store, "kitchen", vectors)
     index = store.places(row)
     assert index is not None
+    await index.open()
     await index.load(named("kitchen", vectors))
     async with store._database.write() as connection:
         for statement in (

@@ -21,6 +21,7 @@ from magic_core.wire import encode_submap
 from magic_server.store import Asked, BlobFolder, BlobWriter, NewSubmap, Store, Vertex
 from magic_server.store.blobs import translated_disk_errors
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import stored_vertices
 
 NO_DIGESTS = cast("tuple[str, ...]", (None,) * 5)  # what no transaction takes
 
@@ -109,7 +110,7 @@ async def test_a_submap_is_found_again_by_another_store(tmp_path: Path) -> None:
                 assert await store.add_submap(agent, made, blobs, now=2.0) is None
         async with Store(tmp_path, threads) as store:
             session = await store.agents.session("room")
-            vertices = await store.submaps.vertices(session)
+            vertices = await stored_vertices(store, session)
             assert [vertex.name for vertex in vertices] == [submap.name for submap in submaps]
             assert [v.odometry and v.odometry.previous_index for v in vertices] == [None, 0, 1]
             assert (vertices[1].descriptor.vector == submaps[1].descriptor.vector).all()
@@ -224,7 +225,7 @@ async def test_submaps_that_wait_together_are_committed_together(
     await asyncio.gather(*(add(number) for number in range(12)))
     assert sum(rounds) == 12
     assert len(rounds) <= 2  # the first, and all who came meanwhile
-    vertices = await store.submaps.vertices(agents[0].session)
+    vertices = await stored_vertices(store, agents[0].session)
     assert [vertex.name for vertex in vertices] == ended  # told in the order of the rows
 
 
@@ -245,7 +246,7 @@ async def test_nobody_fails_for_another_of_the_same_commit(store: Store) -> None
     assert first is None
     assert third is None
     assert isinstance(second, Exception)
-    vertices = await store.submaps.vertices(agents[0].session)
+    vertices = await stored_vertices(store, agents[0].session)
     assert [vertex.name for vertex in vertices] == [made[0][0].vertex.name, made[2][0].vertex.name]
     assert set(store.blobs.names()) == kept  # those of the broken one are taken back
 
@@ -259,7 +260,7 @@ async def test_of_one_submap_by_two_requests_at_once_the_first_is_stored(store: 
     assert answers[0] is None
     assert answers[1] is not None
     assert answers[1].request_id == "r"
-    assert len(await store.submaps.vertices(agent.session)) == 1
+    assert len(await stored_vertices(store, agent.session)) == 1
 
 
 async def test_a_damaged_file_is_not_relied_on_and_is_replaced(store: Store) -> None:

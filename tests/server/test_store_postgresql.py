@@ -28,6 +28,7 @@ from magic_server.store_config import StoreConfig
 from tests.postgresql import PASSWORD, USER, PostgresServer
 from tests.server.test_store_durability import new_submap, registered
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.stored import stored_vertices
 
 OpenStore = Callable[..., "asyncio.Future[Store]"]
 
@@ -84,7 +85,7 @@ async def test_a_lease_that_was_lost_refuses_writes_within_the_transaction(
     with pytest.raises(HeldElsewhere):
         await first.loops.save_solution(session, revision=9, snapshot=b"", kept=set(), settled=True)
     await add(second, make_submap(index=1))
-    assert len(await first.submaps.vertices(session)) == 2
+    assert len(await stored_vertices(first, session)) == 2
     assert (await first.loops.solution(session)).whole is None
     assert await first.leases.renew() == (set(), {session.id})
 
@@ -400,7 +401,7 @@ async def test_a_folder_from_before_keyframes_had_descriptors_opens_and_takes_th
         async with Store(tmp_path, threads) as store:
             await add(store, described)
         async with Store(tmp_path, threads) as store:
-            old, new = await store.submaps.vertices(await store.agents.session("room"))
+            old, new = await stored_vertices(store, await store.agents.session("room"))
     assert old.keyframes == ()
     assert [place for place, _ in new.keyframes] == [1, 2]
     for (_, vector), keyframe in zip(new.keyframes, described.keyframes[1:], strict=True):
@@ -439,7 +440,7 @@ async def test_an_existing_folder_opens_with_all_it_holds(
         async with Store(tmp_path, threads) as store:
             await add(store, make_submap(index=1))
             session = await store.agents.session("room")
-            assert len(await store.submaps.vertices(session)) == 2
+            assert len(await stored_vertices(store, session)) == 2
             asked = Asked("again", bytes(32), 5.0)
             assert await store.agents.finish("room", "agent_0", asked=asked) == 2
             async with store._database.write() as connection:
