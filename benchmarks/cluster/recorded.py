@@ -1,168 +1,202 @@
-"""How a server's database grows with recorded sub-map headers, from a thousand to a million.
+"""How a server grows with recorded sub-map headers, from a thousand to a million of them.
 
-The headers are those of a finished run, sent again under new names by a hundred agents: the tables,
-the rows and the transactions are the server's own, only the blobs are not there. At each size it is
-told what a new sub-map's transaction takes (synced to the disk), what reading one header and one
-page of a listing take, and how long a restart reads what the index and the pose graph need.
+The headers are those of a finished run, sent again under new names by a hundred agents, ten of
+each place: the tables, the rows and the transactions are the server's own, only the blobs are not
+there. At each size it is told what a new sub-map's transaction takes (synced to the disk), what
+reading one header and one page of a listing take, and what a server takes that is started on it:
+time, memory, and how long its index is asked. Between two sizes rows are put in by many, without
+the index of blobs, which is made again before anything is measured.
 
 Examples:
   magic run DATASET --scale 0.5 --out runs/room
   OMP_NUM_THREADS=1 python benchmarks/cluster/recorded.py runs/room --sizes 1000 10000 100000
+  ... --database postgresql+asyncpg://magic:PASSWORD@127.0.0.1/magic   # and pgvector
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
+import subprocess
+import sys
 import tempfile
 import time
-import uuid
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from magicslam.v1 import submap_pb2
+import sqlalchemy as sa
+from filling import EACH, SESSION, Filling, recorded_headers
 from scale import rss_mib, spread
 
 from magic_core.evaluation import RunFolder
-from magic_core.wire import geometry, names
-from magic_server.store import AgentRow, Asked, NewSubmap, SessionRow, Store, Vertex
-from magic_server.store.submaps import Arrival
+from magic_core.wire import names
+from magic_server.cluster_config import ClusterConfig
+from magic_server.config import ListenConfig, ServerConfig
+from magic_server.coordinator import SessionCoordinator
+from magic_server.jobs import JobConfig
+from magic_server.posegraph import PoseGraphConfig
+from magic_server.server import Server
+from magic_server.store import Store, schema
+from magic_server.store_config import StoreConfig
 
-AGENTS = 100
-TOGETHER = 500
-"""Sub-maps of one transaction while the database is filled."""
+REPLICA = "measured"
 SINGLE = 200
-"""Sub-maps, headers and pages that are timed at each size."""
+"""Sub-maps, headers, pages and queries that are timed at each size."""
+NEIGHBOURS = 48
+"""That a new sub-map asks for."""
 
 
-def database_mb(folder: Path) -> float:
-    """Size of the database's files."""
-    return round(sum(file.stat().st_size for file in folder.glob("magic.sqlite*")) / 1e6, 1)
-
-
-async def recorded_headers(run: RunFolder) -> list[submap_pb2.SubmapHeader]:
-    """The headers of a run's sub-maps."""
-    found = []
+@contextlib.asynccontextmanager
+async def opened(folder: Path, config: StoreConfig) -> AsyncIterator[Store]:
+    """The store, for whoever fills and measures it."""
     with ThreadPoolExecutor(2) as threads:
-        async with Store(run.server_folder, threads) as store:
-            for name in run.read_components().anchors:
-                session, agent, index = names.parse_submap(name)
-                row = await store.agents.session(session)
-                stored = await store.submaps.stored(row, agent, index)
-                found.append(submap_pb2.SubmapHeader.FromString(stored.header))
-    return found
+        async with Store(folder, threads, config=config, replica=REPLICA) as store:
+            if store.leases is not None:
+                store.leases.begin(address="127.0.0.1:1", lease_s=3600.0)
+            yield store
 
 
-class Filling:
-    """A store that recorded headers are put into, again and again."""
-
-    def __init__(self, store: Store, headers: list[submap_pb2.SubmapHeader]) -> None:
-        self._store, self._headers = store, headers
-        self._agents: list[AgentRow] = []
-        self._generator = np.random.default_rng(0)
-        self.count = 0
-
-    @property
-    def session(self) -> SessionRow:
-        """The only one."""
-        return self._agents[0].session
-
-    async def register(self) -> None:
-        """Enter the agents."""
-        descriptor = self._headers[0].image_descriptor
-        for number in range(AGENTS):
-            asked = Asked(uuid.uuid4().hex, bytes(32), time.time())
-            entered = await self._store.agents.register(
-                "fleet", f"a{number:02d}", model_id=descriptor.model_id,
-                dimension=len(descriptor.vector), asked=asked,
-            )  # fmt: skip
-            self._agents.append(entered.agent)
-
-    def arrival(self) -> Arrival:
-        """The next sub-map; the agents take turns."""
-        agent, index = self._agents[self.count % AGENTS], self.count // AGENTS
-        found = Arrival(agent, self._new(agent, index), time.time())
-        self.count += 1
-        return found
-
-    async def fill(self, size: int) -> float:
-        """Have so many; returns the processor's seconds for each thousand."""
-        started, before = time.process_time(), self.count
-        while self.count < size:
-            together = min(TOGETHER, size - self.count)
-            await self._store.submaps.insert([self.arrival() for _ in range(together)])
-        return 1e3 * (time.process_time() - started) / max(self.count - before, 1)
-
-    def place(self) -> tuple[str, int]:
-        """Agent and index of any stored one."""
-        number = int(self._generator.integers(self.count))
-        return self._agents[number % AGENTS].name, number // AGENTS
-
-    def _new(self, agent: AgentRow, index: int) -> NewSubmap:
-        header = submap_pb2.SubmapHeader()
-        header.CopyFrom(self._headers[self.count % len(self._headers)])
-        header.name = names.submap_name(agent.session.name, agent.name, index)
-        header.request_id = uuid.uuid4().hex
-        header.ClearField("odometry")
-        if index:
-            header.odometry.previous_index = index - 1
-            header.odometry.previous_from_anchor.CopyFrom(geometry.pose_to_proto(np.eye(4)))
-            header.odometry.information.extend(geometry.information_to_list(np.eye(6)))
-        for blob in header.blobs:  # no two sub-maps have the same ones
-            blob.sha256 = self._generator.bytes(32)
-        digests = tuple(blob.sha256.hex() for blob in header.blobs)
-        return NewSubmap(header, self._generator.bytes(32), 50_000, digests, Vertex.of(header))
-
-
-async def measure(filling: Filling, store: Store, size: int, database: Path) -> dict:
-    """Fill up to a size, then time what a server does with it."""
-    fill_s = await filling.fill(size)
+async def measure_store(filling: Filling, store: Store) -> dict:
+    """Time what a server does with it one by one."""
     added, read, listed = [], [], []
     for _ in range(SINGLE):
         arrival = filling.arrival()
         started = time.perf_counter()
         await store.submaps.insert([arrival])
         added.append(time.perf_counter() - started)
-    for _ in range(SINGLE):
-        agent, index = filling.place()
+    for number in range(SINGLE):
+        agent, index = filling.some()
         started = time.perf_counter()
         await store.submaps.stored(filling.session, agent, index)
         read.append(time.perf_counter() - started)
-        after = int(filling.count * np.random.default_rng(len(listed)).random())
+        after = int(filling.count * np.random.default_rng(number).random())
         started = time.perf_counter()
         await store.submaps.page(filling.session, after=after)
         listed.append(time.perf_counter() - started)
-    before = rss_mib()
-    started = time.process_time()
-    vertices = await store.submaps.vertices(filling.session)
-    start_s = time.process_time() - started
-    assert len(vertices) == filling.count
+    async with store._database.write(filling.session.id) as connection:
+        await connection.execute(sa.update(schema.submaps).values(searched=True))
     return {
-        "size": size,
-        "filled_s_per_1000": round(fill_s, 2),
         "transaction_ms": spread(added),
         "header_ms": spread(read),
         "page_of_100_ms": spread(listed),
-        "restart_reads_s": round(start_s, 2),
-        "restart_mib": round(rss_mib() - before, 1),
-        "database_mb": database_mb(database),
     }
+
+
+async def database_mb(store: Store, folder: Path) -> float:
+    """What the database takes on the disk."""
+    if store._database.engine.shared:
+        size = sa.select(sa.func.pg_database_size(sa.func.current_database()))
+        async with store._database.read() as connection:
+            return round((await connection.scalar(size) or 0) / 1e6, 1)
+    return sqlite_mb(folder)
+
+
+def sqlite_mb(folder: Path) -> float:
+    """Size of the files of SQLite."""
+    return round(sum(file.stat().st_size for file in folder.glob("magic.sqlite*")) / 1e6, 1)
+
+
+def now_mib() -> float:
+    """The memory that this process has now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return round(pages * 4096 / (1 << 20), 1)
+
+
+async def measure_start(folder: Path, config: StoreConfig) -> dict:
+    """Start a server on the store and ask its index. Needs a process of its own."""
+    settings = ServerConfig(
+        data_dir=folder,
+        store=config,
+        cluster=ClusterConfig(replica=REPLICA),
+        listen=ListenConfig(port=0),
+        jobs=JobConfig(workers=1),
+        posegraph=PoseGraphConfig(hierarchy="off"),
+    )
+    started, ticked = time.perf_counter(), time.process_time()
+    async with Server(settings) as server:
+        while (found := server.sessions.found(SESSION)) is None:  # noqa: ASYNC110  # nobody tells
+            await asyncio.sleep(0.01)
+        wall_s, processor_s = time.perf_counter() - started, time.process_time() - ticked
+        return {
+            "start_wall_s": round(wall_s, 2),
+            "start_s": round(processor_s, 2),
+            "start_peak_mib": rss_mib(),
+            "started_mib": now_mib(),
+        } | await measure_queries(found)
+
+
+async def measure_queries(session: SessionCoordinator) -> dict:
+    """How long the index is asked, and how many of a place it finds."""
+    rows = [row async for row in _names_of_places(session)]
+    times, found = [], 0
+    for place in rows:
+        _, agent, index = names.parse_submap(place[0])
+        vertex = await session._store.submaps.vertex(session.session, agent, index)
+        started = time.perf_counter()
+        hits = await session._places.nearest(vertex.descriptor.vector[None], NEIGHBOURS)
+        times.append(time.perf_counter() - started)
+        found += len({hit.name for hit in hits} & {*place})
+    if not rows:
+        return {}
+    return {"query_ms": spread(times), "of_one_place_found": round(found / len(rows) / EACH, 4)}
+
+
+async def _names_of_places(session: SessionCoordinator) -> AsyncIterator[list[str]]:
+    """The sub-maps of some places, those of each by order of arrival."""
+    count = len(session.graph.online)
+    for place in np.random.default_rng(0).integers(0, count // EACH, SINGLE if count else 0):
+        row, _ = await session._store.submaps.page(
+            session.session, after=EACH * int(place), limit=EACH
+        )
+        yield [one.name for one in row]
+
+
+def started_alone(options: argparse.Namespace, folder: Path) -> dict:
+    """`measure_start` in a process of its own."""
+    command = [sys.executable, __file__, str(options.run), "--start", str(folder)]
+    command += ["--database", options.database] if options.database else []
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 async def main(options: argparse.Namespace) -> None:
     """One store that grows from size to size."""
+    index = "pgvector" if options.database else "faiss"
+    config = StoreConfig(database=options.database, index=index)
+    if options.start is not None:
+        print(json.dumps(await measure_start(options.start, config)))
+        return
     headers = await recorded_headers(RunFolder(options.run))
     sizes = [len(header.SerializeToString()) for header in headers]
     print(json.dumps({"recorded": len(headers), "header_bytes_mean": float(np.mean(sizes))}))
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder, ThreadPoolExecutor(2) as some:
-        async with Store(Path(folder), some) as store:
-            filling = Filling(store, headers)
-            await filling.register()
-            for size in options.sizes:
-                found = await measure(filling, store, size, Path(folder))
-                print(json.dumps(found), flush=True)
+    filling = Filling(headers)
+    with tempfile.TemporaryDirectory(dir=options.folder) as name:
+        folder = Path(name)
+        async with opened(folder, config) as store:
+            await filling.register(store)
+        empty = started_alone(options, folder)
+        print(json.dumps({"empty": empty}), flush=True)
+        for size in options.sizes:
+            async with opened(folder, config) as store:
+                if store.leases is not None:
+                    await store.leases.take(filling.session)
+                fill_s = await filling.fill(store, size, folder)
+                found = {"part": "server", "size": filling.count, "dimension": filling.dimension}
+                found["filled_s_per_1000"] = round(fill_s, 2)
+                found |= await measure_store(filling, store)
+                found["database_mb"] = await database_mb(store, folder)
+            if store.leases is not None:  # the first start fills pgvector's table
+                found["index_filled_s"] = started_alone(options, folder)["start_wall_s"]
+            found |= started_alone(options, folder)
+            found["mib"] = round(found["start_peak_mib"] - empty["start_peak_mib"], 1)
+            print(json.dumps(found), flush=True)
+            if filling.count < size:
+                print(json.dumps({"size": size, "limit": "less than 12 GiB free on the disk"}))
+                return
 
 
 if __name__ == "__main__":
@@ -171,5 +205,7 @@ if __name__ == "__main__":
     )
     parser.add_argument("run", type=Path, help="the folder of a finished `magic run`")
     parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000])
-    parser.add_argument("--folder", type=Path, help="where the database is made and removed")
+    parser.add_argument("--folder", type=Path, help="where the data are put and removed")
+    parser.add_argument("--database", default="", help="an empty one of PostgreSQL, not SQLite")
+    parser.add_argument("--start", type=Path, help=argparse.SUPPRESS)
     asyncio.run(main(parser.parse_args()))

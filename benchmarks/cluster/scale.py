@@ -8,7 +8,8 @@ the processor, one thread; a size that runs into a limit is recorded with that l
 Examples:
   OMP_NUM_THREADS=1 python benchmarks/cluster/scale.py descriptors --sizes 1000 10000 100000 1000000
   OMP_NUM_THREADS=1 python benchmarks/cluster/scale.py graph --sizes 1000 10000 --out graph.jsonl
-  python benchmarks/cluster/scale.py plot descriptors.jsonl graph.jsonl --out scale.png
+  OMP_NUM_THREADS=1 python benchmarks/cluster/recorded.py runs/room > server.jsonl
+  python benchmarks/cluster/scale.py plot descriptors.jsonl graph.jsonl server.jsonl --out scale.png
 """
 
 from __future__ import annotations
@@ -255,37 +256,47 @@ def each_alone(options: argparse.Namespace) -> None:
 
 
 def plot(files: list[Path], out: Path) -> None:
-    """Growth of times and memory over the number of sub-maps, both axes logarithmic."""
+    """Growth of times and memory over the number of sub-maps, all axes logarithmic."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     rows = [json.loads(line) for file in files for line in file.read_text().splitlines()]
-    rows = [row for row in rows if "limit" not in row]
-    figure, (times, memory) = pyplot.subplots(1, 2, figsize=(10, 3.8))
+    rows = [row for row in rows if "part" in row and "limit" not in row]
+    figure, (times, starts, memory) = pyplot.subplots(1, 3, figsize=(14, 4.4))
     for part, kind in sorted({(row["part"], _kind(row)) for row in rows}):
         own = [row for row in rows if (row["part"], _kind(row)) == (part, kind)]
         own.sort(key=lambda row: row["size"])
         sizes = [row["size"] for row in own]
-        shown = ("query_ms",) if part == "descriptors" else ("placed_ms", "accepted_loop_ms")
-        for key in shown:
+        for key in _TIMES[part]:
             label = f"{key.removesuffix('_ms').replace('_', ' ')}, {kind}"
             (line,) = times.loglog(sizes, [row[key]["p50"] for row in own], "o-", label=label)
             p99 = [row[key]["p99"] for row in own]
             times.loglog(sizes, p99, "_", color=line.get_color(), markersize=12)
+        begun = [row[_START[part]] for row in own]
+        starts.loglog(sizes, begun, "o-", label=f"{part}, {kind}")
         memory.loglog(sizes, [row["mib"] for row in own], "o-", label=f"{part}, {kind}")
-    times.set(xlabel="sub-maps", ylabel="ms of processor, p50 (dots) and p99 (bars)")
-    memory.set(xlabel="sub-maps", ylabel="MiB")
-    for axes in (times, memory):
+    times.set(xlabel="sub-maps", ylabel="ms, p50 (dots) and p99 (bars)")
+    starts.set(xlabel="sub-maps", ylabel="s of processor until it is taken up")
+    memory.set(xlabel="sub-maps", ylabel="MiB at most")
+    for axes in (times, starts, memory):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(out, dpi=90)
 
 
+_TIMES = {
+    "descriptors": ("query_ms",),
+    "graph": ("placed_ms", "accepted_loop_ms"),
+    "server": ("query_ms", "transaction_ms", "header_ms"),
+}
+_START = {"descriptors": "load_s", "graph": "restore_s", "server": "start_s"}
+
+
 def _kind(row: dict) -> str:
-    if row["part"] == "descriptors":
+    if "dimension" in row:
         return f"{row['dimension']} numbers"
     return f"hierarchy {row['hierarchy']}"
 

@@ -17,7 +17,10 @@ from magic_server.places.hits import Hit, Place, best_of_each
 
 EXACT_LIMIT = 100_000
 TRAINING_VECTORS_PER_LIST = 50
-LISTS_PROBED = 32
+TRAINING_ROUNDS = 4
+"""Of k-means, which finds the lists: ten take twice as long and find nothing more."""
+LISTS_PROBED = 64
+"""Of 2,000: of ten descriptors of a place among a million they find more than 97 %."""
 LOADED_AT_ONCE = 10_000
 BLAS_THRESHOLD = 3072
 """FAISS skips BLAS for small batches of long vectors, which is 18 times slower at 384 numbers."""
@@ -41,11 +44,10 @@ class DescriptorIndex:
         self._index: Any = faiss.IndexIDMap2(faiss.IndexFlatIP(dimension))
         self._is_exact = True
         self._id_of: dict[str, int] = {}  # of the anchor
-        self._name_of: dict[int, str] = {}
+        self._names: list[str] = []  # by number of a vector; empty for what was removed
         # Of keyframes alone, so that they cost nothing where there are none.
         self._others_of: dict[str, tuple[int, ...]] = {}
         self._keyframe_of: dict[int, int] = {}
-        self._next_id = 0
 
     def __len__(self) -> int:
         return len(self._id_of)
@@ -61,7 +63,7 @@ class DescriptorIndex:
     @property
     def vectors(self) -> int:
         """How many vectors there are, those of keyframes included."""
-        return len(self._name_of)
+        return self._index.ntotal
 
     def add(self, place: Place) -> None:
         """Store the vectors (dimension,) of a place, normalised.
@@ -91,7 +93,7 @@ class DescriptorIndex:
             raise NotFound(f"descriptor {name!r} is not in the index")
         identifiers = [self._id_of.pop(name), *self._others_of.pop(name, ())]
         for identifier in identifiers:
-            del self._name_of[identifier]
+            self._names[identifier] = ""
             self._keyframe_of.pop(identifier, None)
         self._index.remove_ids(np.array(identifiers, dtype=np.int64))
 
@@ -127,14 +129,14 @@ class DescriptorIndex:
     def _are_enough(self, identifiers: NDArray[np.int64], k: int) -> bool:
         """Whether each query has found k places, or everything that it can."""
         return all(
-            row[-1] < 0 or len({self._name_of[identifier] for identifier in row.tolist()}) >= k
+            row[-1] < 0 or len({self._names[identifier] for identifier in row.tolist()}) >= k
             for row in identifiers
         )
 
     def _hit(self, found: tuple[float, int, int]) -> Hit:
         negative, identifier, query = found
         keyframe = self._keyframe_of.get(identifier, 0)
-        return Hit(self._name_of[identifier], -negative, keyframe, query)
+        return Hit(self._names[identifier], -negative, keyframe, query)
 
     def _store(self, places: Sequence[Place]) -> None:
         rows = [
@@ -142,15 +144,13 @@ class DescriptorIndex:
             for place in places
             for vector in (place.vector, *(other for _, other in place.keyframes))
         ]
-        identifiers = np.arange(self._next_id, self._next_id + len(rows))
+        identifiers = np.arange(len(self._names), len(self._names) + len(rows))
         self._index.add_with_ids(np.concatenate(rows), identifiers)
         for place in places:
-            first, self._next_id = self._next_id, self._next_id + 1 + len(place.keyframes)
-            self._id_of[place.name] = first
-            for identifier in range(first, self._next_id):
-                self._name_of[identifier] = place.name
+            first = self._id_of[place.name] = len(self._names)
+            self._names += [place.name] * (1 + len(place.keyframes))
             if place.keyframes:
-                self._others_of[place.name] = tuple(range(first + 1, self._next_id))
+                self._others_of[place.name] = tuple(range(first + 1, len(self._names)))
             for identifier, (keyframe, _) in enumerate(place.keyframes, first + 1):
                 self._keyframe_of[identifier] = keyframe
 
@@ -179,7 +179,9 @@ class DescriptorIndex:
     def _become_inverted_file(self) -> None:
         faiss = self._faiss
         count = self._index.ntotal
-        vectors = self._index.index.reconstruct_n(0, count)
+        # As they lie there: a copy of all of them may be more than there is memory.
+        flat = faiss.downcast_index(self._index.index)
+        vectors = faiss.rev_swig_ptr(flat.get_xb(), count * self.dimension).reshape(count, -1)
         identifiers = faiss.vector_to_array(self._index.id_map)
         lists = max(1, min(2000, count // TRAINING_VECTORS_PER_LIST))
         quantiser = faiss.IndexFlatIP(self.dimension)
@@ -189,8 +191,8 @@ class DescriptorIndex:
         )  # fmt: skip
         # FAISS frees neither: the Python reference keeps the quantiser alive.
         inverted.referenced_objects = [quantiser]
-        sample = np.random.default_rng(0).permutation(count)[: lists * TRAINING_VECTORS_PER_LIST]
-        inverted.train(np.ascontiguousarray(vectors[np.sort(sample)]))
+        inverted.cp.niter = TRAINING_ROUNDS
+        inverted.train(vectors[: lists * TRAINING_VECTORS_PER_LIST])
         inverted.add_with_ids(vectors, identifiers)
         self._index = inverted
         self._is_exact = False
