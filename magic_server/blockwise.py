@@ -1,9 +1,8 @@
 """Merging block by block: a job that plans, jobs for each block, a job that joins them.
 
-Each block is refined twice, by itself and then shortly beside its refined neighbours, and has a
-folder for each. After a restart of the server the jobs of blocks that were done find them done; one
-that was begun goes on from its last checkpoint in the first round, and begins anew in the second.
-Where jobs leave their files in a bucket, which keeps no folders, all of it begins anew.
+Each block is refined in rounds, by itself and then beside its neighbours, and has a folder for
+each. After a restart of the server the jobs of blocks that were done find them done; one that was
+begun goes on from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -15,19 +14,21 @@ from typing import Any
 
 from magicslam.v1 import submap_pb2
 
-from magic_server.globalmap.blocks import REFINED, blocks_near
+from magic_server.globalmap.blocks import ROUNDS, Block, blocks_near, blocks_showing
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.blockwise import (
+    BesideTask,
     BlockOutcome,
     BlockTask,
     JoinTask,
+    MadeFile,
     PlannedBlock,
     PlanTask,
-    TouchTask,
+    RefinedBlocks,
     join_blocks,
     plan_merge,
     refine_block,
-    touch_up_block,
+    refine_block_beside,
 )
 from magic_server.jobs.delivery import Deliveries, Delivery, Progress
 from magic_server.jobs.tasks import MergeOutcome, MergeTask
@@ -62,7 +63,7 @@ class BlockwiseMerge:
         self._task, self._folder = task, folder
         self._jobs, self._deliveries = jobs, deliveries
         self._turn = asyncio.Semaphore(at_once)
-        self._planning = deliveries.of(folder / "plan")
+        self._planning = deliveries.of(folder / "plan", lasting=True)
         self._begun: dict[int, Delivery] = {}
         self._round = "dividing space into blocks"
         self._before, self._share, self._done, self._count = 0.0, 0.0, 0, 0
@@ -72,39 +73,65 @@ class BlockwiseMerge:
         """The merged map; the first error of any job ends all."""
         plan = PlanTask(self._task.submaps, self._task.config, self._planning)
         planned = await self._jobs.run(plan_merge, plan)
-        tasks = [self._block_task(block, f"block-{i:04d}") for i, block in enumerate(planned)]
-        self._begin_round("refining", len(planned), before=_PLANNED, share=REFINED - _PLANNED)
-        files = await self._each(refine_block, [(task, task.delivery) for task in tasks])
-
-        blocks = [task.block for task in tasks]
-        tasks = [self._block_task(block, f"border-{i:04d}") for i, block in enumerate(planned)]
-        touching = [
-            TouchTask(task, files[i], tuple(files[other] for other in blocks_near(blocks, i)))
-            for i, task in enumerate(tasks)
+        blocks = [one.block for one in planned]
+        first, *others = ROUNDS
+        self._begin_round("refining", len(planned), first)
+        tasks = [
+            self._block_task(block, f"block-{i:04d}", first) for i, block in enumerate(planned)
         ]
-        self._begin_round("refining borders", len(planned), before=REFINED, share=1.0 - REFINED)
-        files = await self._each(touch_up_block, [(task, task.block.delivery) for task in touching])
+        made = await self._each(refine_block, [(task, task.delivery) for task in tasks])
+        for count, span in enumerate(others, start=1):
+            self._begin_round("refining borders", len(planned), span)
+            beside = [
+                BesideTask(
+                    self._block_task(block, f"beside-{count}-{i:04d}", span), i, span[0],
+                    self._refined(made, blocks, [i, *blocks_near(blocks, i)]),
+                )
+                for i, block in enumerate(planned)
+            ]  # fmt: skip
+            given = [(task, task.block.delivery) for task in beside]
+            made = await self._each(refine_block_beside, given)
         self._round = "joining blocks"
-        joining = JoinTask(tuple(files), self._deliveries.of(self._folder / "join"))
+        joining = JoinTask(
+            tuple(self._refined(made, blocks, [i]) for i in range(len(blocks))),
+            self._task.config,
+            self._deliveries.of(self._folder / "join", lasting=True),
+        )
         return await self._jobs.run(join_blocks, joining)
 
-    def _begin_round(self, name: str, count: int, *, before: float, share: float) -> None:
+    def _begin_round(self, name: str, count: int, span: tuple[float, float]) -> None:
         self._round, self._count, self._done = name, count, 0
-        self._before, self._share = before, share
+        self._before = _PLANNED + (1.0 - _PLANNED) * span[0]
+        self._share = (1.0 - _PLANNED) * (span[1] - span[0])
 
-    def _block_task(self, planned: PlannedBlock, folder: str) -> BlockTask:
+    def _block_task(
+        self, planned: PlannedBlock, folder: str, span: tuple[float, float]
+    ) -> BlockTask:
         return BlockTask(
             tuple(self._task.submaps[i] for i in planned.submaps),
             planned.block,
             self._task.config,
             self._task.threads,
-            self._deliveries.of(self._folder / folder),
+            self._deliveries.of(self._folder / folder, lasting=True),
+            span[1],
         )
+
+    def _refined(
+        self, made: Sequence[BlockOutcome], blocks: Sequence[Block], numbers: Sequence[int]
+    ) -> RefinedBlocks:
+        """Some blocks after a round, with what others made of them."""
+        own = {number: self._streamed(made[number].own) for number in numbers}
+        others = sorted({other for number in numbers for other in blocks_showing(blocks, number)})
+        handed = [made[other].handed for other in others]
+        return RefinedBlocks(own, [self._streamed(one) for one in handed if one is not None])
+
+    def _streamed(self, made: MadeFile) -> StreamedFile:
+        return self._deliveries.streamed(made.file, made.sha256)
 
     async def _each(
         self, function: Callable[[Any], BlockOutcome], tasks: Sequence[tuple[Any, Delivery]]
-    ) -> list[StreamedFile]:
-        """The file of each block, in order."""
+    ) -> list[BlockOutcome]:
+        """What each block's job made, in order."""
         try:
             async with asyncio.TaskGroup() as group:
                 made = [
@@ -113,8 +140,7 @@ class BlockwiseMerge:
                 ]
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
-        outcomes = [one.result() for one in made]
-        return [self._deliveries.streamed(one.file, one.sha256) for one in outcomes]
+        return [one.result() for one in made]
 
     async def _one(
         self, number: int, function: Callable[[Any], BlockOutcome], task: Any, delivery: Delivery

@@ -64,8 +64,11 @@ class GlobalMaps:
 
         Unless `everything` is taken up, that waits for `resume`.
         """
+        left = await self._in_thread(self._deliveries.lasting)  # before: new ones may begin
         unfinished = await self._store.maps.unfinished()
         open_folders = {self._folder_of(operation.id) for operation in unfinished}
+        for name in left - {folder.name for folder in open_folders}:
+            await self._in_thread(self._delivery(self._store.scratch / name).clear)
         for leftover in self._store.scratch.glob(f"{_MERGE_PREFIX}*"):
             if leftover not in open_folders:
                 await self._in_thread(shutil.rmtree, leftover, True)
@@ -163,7 +166,7 @@ class GlobalMaps:
         chosen = chosen_poses(snapshot, request.component)
         folder = self._folder_of(operation)
         await self._in_thread(lambda: folder.mkdir(exist_ok=True))
-        delivery = self._deliveries.of(folder)
+        delivery = self._delivery(folder)
         try:
             try:
                 task = await self._task(coordinator, chosen, request, delivery)
@@ -176,6 +179,9 @@ class GlobalMaps:
             if not self._closing:  # a server that stops keeps what it has, to go on from there
                 await asyncio.shield(self._in_thread(delivery.clear))
                 await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
+
+    def _delivery(self, folder: Path) -> Delivery:
+        return self._deliveries.of(folder, lasting=True)
 
     def _folder_of(self, operation: int) -> Path:
         return self._store.scratch / f"{_MERGE_PREFIX}{operation}"

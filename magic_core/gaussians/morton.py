@@ -36,10 +36,15 @@ def morton_codes(grid: NDArray) -> NDArray[np.uint64]:
 
 def in_morton_order(cloud: GaussianCloud) -> GaussianCloud:
     """The same Gaussians (finite means), sorted by the Morton code of their position."""
+    return cloud if len(cloud) < 2 else cloud.select(morton_order(cloud))
+
+
+def morton_order(cloud: GaussianCloud) -> NDArray[np.intp]:
+    """(n,) indices that sort Gaussians (finite means) by the Morton code of their position."""
     if len(cloud) < 2:
-        return cloud
+        return np.arange(len(cloud))
     points = cloud.means.astype(np.float64)
     low = points.min(axis=0)
     step = max(float((points.max(axis=0) - low).max()), 1e-12) / (2**BITS - 1)
     grid = np.rint((points - low) / step).astype(np.int64)
-    return cloud.select(np.argsort(morton_codes(grid), kind="stable"))
+    return np.argsort(morton_codes(grid), kind="stable")

@@ -112,7 +112,7 @@ def our_scheme(
     said: Said,
 ) -> dict[str, Any]:
     """Our refinement, judged after each pass; says when it first reached a train PSNR."""
-    from magic_server.globalmap.merge import optimiser_of
+    from magic_server.globalmap.rounds import optimiser_of
 
     clock = _Clock()
     clock.go()

@@ -24,8 +24,8 @@ _GUEST_SHARE = 0.2  # of a keyframe's samples inside a box, for it to teach the 
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
 
-REFINED = 0.8
-"""Share of a merge's progress when each block has been refined by itself."""
+ROUNDS = ((0.0, 0.6), (0.6, 0.8), (0.8, 1.0))
+"""From where to where in the schedule of refinement each round of several blocks goes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,3 +154,10 @@ def blocks_near(blocks: Sequence[Block], number: int) -> list[int]:
     block = blocks[number]
     others = (i for i in range(len(blocks)) if i != number)
     return [i for i in others if block.touches(blocks[i].low, blocks[i].high)]
+
+
+def blocks_showing(blocks: Sequence[Block], number: int) -> list[int]:
+    """The other blocks whose keyframes may show a block's Gaussians."""
+    block = blocks[number]
+    others = (i for i in range(len(blocks)) if i != number)
+    return [i for i in others if blocks[i].touches(block.low, block.high)]

@@ -6,10 +6,9 @@ the mapping losses and removes what turned transparent. Memory holds one block a
 
 from __future__ import annotations
 
-import dataclasses
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,27 +17,21 @@ import numpy as np
 
 from magic_core.errors import InvalidInput
 from magic_core.gaussians import GaussianCloud
-from magic_core.gaussians.morton import in_morton_order
-from magic_core.render import LossWeights
-from magic_core.render.backend import Optimiser, new_optimiser
-from magic_server.globalmap.blocks import REFINED, Block, blocks_near, places_of, plan_blocks
+from magic_server.globalmap import rounds
+from magic_server.globalmap.blocks import (
+    ROUNDS,
+    Block,
+    blocks_near,
+    blocks_showing,
+    places_of,
+    plan_blocks,
+)
 from magic_server.globalmap.config import MergeConfig
 from magic_server.globalmap.parts import Parts, fingerprint_of
-from magic_server.globalmap.placement import (
-    PlacedSource,
-    View,
-    placed_gaussians,
-    view_of,
-)
-from magic_server.globalmap.quality import mean_psnr
-from magic_server.globalmap.refine import FineResult, FineStage, budget_of, rates
+from magic_server.globalmap.placement import PlacedSource, placed_gaussians
+from magic_server.globalmap.refine import FineResult
 
 Progress = Callable[[float, str], None]
-
-_TOUCHED = 0.4
-"""Share of the schedule, its last, that a block goes through once more beside refined neighbours:
-0.2 gains 0.03 dB at the borders, 0.4 0.24 dB (benchmarks/results/global-map.md)."""
-_JUDGED_VIEWS = 24  # keyframes of a block on which the merge reports its own quality
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +78,22 @@ def build_global_map(
 
 
 def merge_into(
-    folder: Path, sources: Sequence[PlacedSource], config: MergeConfig, *, progress: Progress
+    folder: Path,
+    sources: Sequence[PlacedSource],
+    config: MergeConfig,
+    *,
+    progress: Progress,
+    saved: Callable[[], None] = lambda: None,
 ) -> tuple[Parts, MergeSummary]:
-    """Merge into block files in a folder; goes on where an earlier call with it was cut off."""
+    """Merge into block files in a folder; goes on where an earlier call with it was cut off.
+
+    `saved` hears of every checkpoint.
+    """
     config.validate()
     if not sources:
         raise InvalidInput.field("submaps", "none given; a map needs at least one sub-map")
     started = time.perf_counter()
-    parts = Parts(folder, fingerprint_of(sources, config))
+    parts = Parts(folder, fingerprint_of(sources, config), saved=saved)
     if config.refine:
         progress(0.0, "dividing space into blocks")
         blocks = plan_blocks(places_of(sources), most_views=config.block_views)
@@ -112,7 +113,9 @@ def _append(
         progress(number / len(sources), f"appending sub-map {number + 1} of {len(sources)}")
         cloud = placed_gaussians(source)
         nothing = FineResult(iterations=0, converged=False, filled=0, pruned=0)
-        figures.append(_figures(cloud, nothing, coarse=len(cloud), psnr=(None, None), views=0))
+        figures.append(
+            rounds.figures_of(cloud, nothing, coarse=len(cloud), psnr=(None, None), views=0)
+        )
         parts.finish(number, cloud, figures[-1])
     return figures
 
@@ -124,172 +127,60 @@ def _in_blocks(
     config: MergeConfig,
     progress: Progress,
 ) -> tuple[Parts, list[dict[str, Any]]]:
-    """Each block refined by itself, then, where there are several, once more beside the others."""
-    numbers = range(len(blocks))
+    """Each block refined by itself, then, where there are several, beside the others."""
     if len(blocks) == 1:
-        return parts, [refine_block(blocks[0], parts, sources, config, progress=progress)]
+        return parts, [rounds.refine_alone(blocks[0], parts, sources, config, progress=progress)]
 
-    def part(number: int, first: float, last: float, name: str) -> Progress:
+    def part(number: int, span: tuple[float, float], name: str) -> Progress:
         def within(share: float, text: str) -> None:
-            done = first + (last - first) * (number + share) / len(blocks)
+            done = span[0] + (span[1] - span[0]) * (number + share) / len(blocks)
             progress(done, f"{name} {number + 1} of {len(blocks)}: {text}")
 
         return within
 
-    apart = [
-        refine_block(
-            blocks[number], parts, sources, config, number=number,
-            progress=part(number, 0.0, REFINED, "block"),
+    numbers = range(len(blocks))
+    first, *others = ROUNDS
+    figures = [
+        rounds.refine_alone(
+            blocks[number], parts, sources, config, number=number, until=first[1],
+            progress=part(number, first, "block"),
         )
         for number in numbers
     ]  # fmt: skip
-    touched = parts.beside("touched")
-    together = [
-        touch_up(
-            blocks[number], parts.cloud(number),
-            (parts.cloud(other) for other in blocks_near(blocks, number)),
-            touched, sources, config, number=number,
-            progress=part(number, REFINED, 1.0, "border of block"),
-        )
-        for number in numbers
-    ]  # fmt: skip
-    return touched, [_both(*pair) for pair in zip(apart, together, strict=True)]
+    for count, span in enumerate(others, start=1):
+        made = parts.beside(f"round-{count}")
+        for number in numbers:
+            around = dict(_agreed(blocks, parts, [number, *blocks_near(blocks, number)]))
+            found = rounds.refine_beside(
+                blocks[number], around, made, sources, config, number=number, span=span,
+                progress=part(number, span, "border of block"),
+            )  # fmt: skip
+            figures[number] = _both(figures[number], found)
+        parts = made
+    joined = parts.beside("joined")
+    for number in numbers:
+        ((_, cloud),) = _agreed(blocks, parts, [number])
+        shown = rounds.visible(cloud, config)
+        faded = figures[number]["pruned"] + len(cloud) - len(shown)
+        figures[number] |= {"gaussians": len(shown), "pruned": faded}
+        joined.finish(number, shown, figures[number])
+    return joined, figures
 
 
-def _both(apart: dict[str, Any], together: dict[str, Any]) -> dict[str, Any]:
-    """The figures of a block over both rounds."""
-    sums = {name: apart[name] + together[name] for name in ("iterations", "pruned")}
-    last = {name: together[name] for name in ("gaussians", "psnr_fine_db")}
-    return {**apart, **sums, **last}
+def _agreed(
+    blocks: Sequence[Block], parts: Parts, numbers: Sequence[int]
+) -> Iterator[tuple[int, GaussianCloud]]:
+    """Blocks as all agreed on them after the round that `parts` holds."""
+    others = sorted({other for number in numbers for other in blocks_showing(blocks, number)})
+    handed = (guest for other in others for guest in parts.guests(other, owners=numbers))
+    return rounds.agreed_blocks(numbers, parts.cloud, handed)
 
 
-def refine_block(
-    block: Block,
-    parts: Parts,
-    sources: Sequence[PlacedSource],
-    config: MergeConfig,
-    *,
-    number: int = 0,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Refine one block by itself and keep it in `parts`; its figures, at once where it is there."""
-    if (finished := parts.finished(number)) is not None:
-        return finished
-    progress(0.0, "appending sub-maps")
-    views = [view_of(sources[view.source], view.keyframe) for view in block.views]
-    judged = _spread(views, _JUDGED_VIEWS)
-    coarse, own = _coarse_of(block, sources)
-    before = mean_psnr(optimiser_of(coarse, config), judged)
-    taken_up = parts.resumed(number)
-    cloud, done = (coarse, 0) if taken_up is None else (taken_up[0], int(taken_up[1]["done"]))
-    optimiser = optimiser_of(cloud, config)
-    del coarse, cloud
-    stage = FineStage(
-        optimiser,
-        views,
-        config,
-        progress=progress,
-        checkpoint=lambda cloud, done: parts.checkpoint(number, cloud, {"done": done}),
-        done=done,
-    )
-    result = stage.run()
-    psnr = (before, mean_psnr(optimiser, judged))
-    refined = _own_of(block, optimiser)
-    figures = _figures(refined, result, coarse=own, psnr=psnr, views=len(views))
-    parts.finish(number, refined, figures)
-    return figures
-
-
-def touch_up(
-    block: Block,
-    own: GaussianCloud,
-    neighbours: Iterable[GaussianCloud],
-    parts: Parts,
-    sources: Sequence[PlacedSource],
-    config: MergeConfig,
-    *,
-    number: int = 0,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Run the last part of a refined block's schedule once more, beside refined neighbours.
-
-    Each block was refined beside neighbours as they were sent, which are no longer there. All
-    blocks see the others as of the first round, so that the order changes nothing.
-    """
-    if (finished := parts.finished(number)) is not None:
-        return finished
-    progress(0.0, "refining beside its neighbours")
-    views = [view_of(sources[view.source], view.keyframe) for view in block.views]
-    near = [cloud.select(block.wants(cloud.means)) for cloud in neighbours]
-    optimiser = optimiser_of(in_morton_order(GaussianCloud.concatenate([own, *near])), config)
-    del near
-    budget = budget_of(views, config)
-    begun = budget - int(_TOUCHED * budget)
-    stage = FineStage(optimiser, views, config, progress=progress, done=begun)
-    result = stage.run()
-    result = dataclasses.replace(result, iterations=result.iterations - begun)
-    psnr = (None, mean_psnr(optimiser, _spread(views, _JUDGED_VIEWS)))
-    refined = _own_of(block, optimiser)
-    figures = _figures(refined, result, coarse=len(own), psnr=psnr, views=len(views))
-    parts.finish(number, refined, figures)
-    return figures
-
-
-def _own_of(block: Block, optimiser: Optimiser) -> GaussianCloud:
-    """What is kept of a refined block: its neighbours keep the rest."""
-    refined = optimiser.gaussians()
-    return refined.select(block.holds(refined.means))
-
-
-def _coarse_of(block: Block, sources: Sequence[PlacedSource]) -> tuple[GaussianCloud, int]:
-    """The Gaussians that a block's keyframes may show, and how many of them are its own.
-
-    All as their agents sent them, its neighbours' too: no block waits for another, and the map does
-    not depend on the order in which they are refined.
-    """
-    chosen: list[GaussianCloud] = []
-    own = 0
-    for source in sources:
-        cloud = placed_gaussians(source)
-        own += int(block.holds(cloud.means).sum())
-        chosen.append(cloud.select(block.wants(cloud.means)))
-    return in_morton_order(GaussianCloud.concatenate(chosen)), own
-
-
-def optimiser_of(cloud: GaussianCloud, config: MergeConfig) -> Optimiser:
-    """An optimiser with a merge's losses and first learning rates."""
-    return new_optimiser(
-        cloud,
-        weights=LossWeights(
-            ssim=config.ssim_weight,
-            depth=config.depth_weight,
-            scale=config.regularisation_weight,
-        ),
-        learning_rates=rates(config, 0.0),
-        threads=config.threads or None,
-        device=config.device,
-    )
-
-
-def _figures(
-    cloud: GaussianCloud,
-    result: FineResult,
-    *,
-    coarse: int,
-    psnr: tuple[float | None, float | None],
-    views: int,
-) -> dict[str, Any]:
-    return {
-        "gaussians": len(cloud),
-        "coarse": coarse,
-        "iterations": result.iterations,
-        "converged": result.converged,
-        "filled": result.filled,
-        "pruned": result.pruned,
-        "psnr_coarse_db": psnr[0],
-        "psnr_fine_db": psnr[1],
-        "views": views,
-    }
+def _both(before: dict[str, Any], further: dict[str, Any]) -> dict[str, Any]:
+    """The figures of a block over its rounds so far and a further one."""
+    sums = {name: before[name] + further[name] for name in ("iterations", "pruned")}
+    last = {name: further[name] for name in ("gaussians", "psnr_fine_db", "converged")}
+    return {**before, **sums, **last}
 
 
 def _summary(figures: Sequence[dict[str, Any]], seconds: float) -> MergeSummary:
@@ -313,9 +204,3 @@ def _summary(figures: Sequence[dict[str, Any]], seconds: float) -> MergeSummary:
         filled=total("filled"),
         pruned=total("pruned"),
     )
-
-
-def _spread(views: Sequence[View], count: int) -> list[View]:
-    """At most `count` views, evenly spread."""
-    chosen = np.linspace(0, len(views) - 1, min(count, len(views)))
-    return [views[round(i)] for i in chosen]

@@ -2,6 +2,7 @@
 
 plan.json           what is merged, and how: another plan starts anew
 block_0003.mgsc     a refined block, in the lossless codec
+guests_0003.npz     what it made of other blocks' Gaussians, where it saw any
 block_0003.json     its figures; written last, it says that the block is complete
 open_0004.mgsc      the block under way, as of its last checkpoint
 open_0004.json      how far that is
@@ -12,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +21,32 @@ import numpy as np
 
 from magic_core.config import to_mapping
 from magic_core.gaussians import GaussianCloud, codec
+from magic_server.globalmap import consensus
 from magic_server.globalmap.config import MergeConfig
+from magic_server.globalmap.consensus import Guests
 from magic_server.globalmap.placement import PlacedSource
 
 
 class Parts:
     """Blocks that are done, and how far the one under way is."""
 
-    def __init__(self, folder: Path, fingerprint: str) -> None:
-        """Take up a folder where its plan is the same, else empty it."""
-        self._folder, self._fingerprint = folder, fingerprint
+    def __init__(
+        self, folder: Path, fingerprint: str, *, saved: Callable[[], None] = lambda: None
+    ) -> None:
+        """Take up a folder where its plan is the same, else empty it. `saved` hears of every
+        checkpoint."""
+        self._folder, self._fingerprint, self._saved = folder, fingerprint, saved
         folder.mkdir(parents=True, exist_ok=True)
         plan = folder / "plan.json"
         if not plan.is_file() or plan.read_text() != json.dumps(fingerprint):
-            for pattern in ("block_*", "open_*"):
+            for pattern in ("block_*", "guests_*", "open_*"):
                 for leftover in folder.glob(pattern):
                     leftover.unlink()
             _replace(plan, json.dumps(fingerprint).encode())
 
     def beside(self, name: str) -> Parts:
         """Blocks of another round of the same merge, in a folder in this one."""
-        return Parts(self._folder / name, f"{self._fingerprint} {name}")
+        return Parts(self._folder / name, f"{self._fingerprint} {name}", saved=self._saved)
 
     def finished(self, block: int) -> dict[str, Any] | None:
         """The figures of a block that is done."""
@@ -59,8 +65,26 @@ class Parts:
         for block in range(count):
             yield self.cloud(block)
 
-    def finish(self, block: int, cloud: GaussianCloud, figures: dict[str, Any]) -> None:
+    def guests_path(self, block: int) -> Path:
+        """The file of what a block that is done made of others' Gaussians."""
+        return self._folder / f"guests_{block:04d}.npz"
+
+    def guests(self, block: int, *, owners: Iterable[int]) -> list[Guests]:
+        """What a block that is done made of the Gaussians of some others."""
+        path = self.guests_path(block)
+        return consensus.decode(path.read_bytes(), owners=owners) if path.is_file() else []
+
+    def finish(
+        self,
+        block: int,
+        cloud: GaussianCloud,
+        figures: dict[str, Any],
+        *,
+        guests: Sequence[Guests] = (),
+    ) -> None:
         """Keep a block that is done."""
+        if guests:
+            _replace(self.guests_path(block), consensus.encode(guests))
         _replace(self.path(block), codec.encode_lossless(cloud))
         _replace(self._folder / f"block_{block:04d}.json", json.dumps(figures).encode())
         for leftover in self._folder.glob(f"open_{block:04d}.*"):
@@ -71,6 +95,7 @@ class Parts:
         few steps."""
         _replace(self._folder / f"open_{block:04d}.mgsc", codec.encode_lossless(cloud))
         _replace(self._folder / f"open_{block:04d}.json", json.dumps(figures).encode())
+        self._saved()
 
     def resumed(self, block: int) -> tuple[GaussianCloud, dict[str, Any]] | None:
         """The last checkpoint of a block, where there is one."""
@@ -79,6 +104,13 @@ class Parts:
         if figures is None or not path.is_file():
             return None
         return codec.decode(path.read_bytes()), figures
+
+
+def files_of(folder: Path) -> list[Path]:
+    """All that an interrupted merge goes on from in a folder: a job's, of one block."""
+    patterns = ("plan.json", "block_????.*", "guests_????.*", "open_????.*")
+    found = sorted(path for pattern in patterns for path in folder.glob(pattern))
+    return [path for path in found if path.suffix != ".partial"]
 
 
 def fingerprint_of(sources: Sequence[PlacedSource], config: MergeConfig) -> str:

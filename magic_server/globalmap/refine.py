@@ -61,30 +61,36 @@ class FineStage:
         progress: Progress,
         checkpoint: Checkpoint | None = None,
         done: int = 0,
+        until: float = 1.0,
+        remove: bool = True,
         after_pass: Callable[[int], bool] | None = None,
     ) -> None:
         """`checkpoint` is given the cloud and the steps done every 20 s or so; a stage that begins
-        at `done` steps takes such a cloud up. `after_pass` hears the steps done and may end it."""
+        at `done` steps takes such a cloud up. `until`: share of the schedule at which it ends.
+        Without `remove` the Gaussians stay the same ones in their order. `after_pass` hears the
+        steps done and may end it."""
         self._optimiser, self._views, self._config = optimiser, views, config
         self._progress, self._checkpoint, self._done = progress, checkpoint, done
-        self._after_pass = after_pass
+        self._remove, self._after_pass = remove, after_pass
         self._order = VisitOrder(region_weights(views), np.random.default_rng(config.seed))
         self._last_loss = np.full(len(views), np.nan)
         self._exposure = ExposureModel(len(views)) if config.exposure else None
         self._steps_per_pass = max(len(views), _MIN_STEPS_PER_PASS)
         self._budget = budget_of(views, config)
+        self._first, self._last = done, round(until * self._budget)
 
     def run(self) -> FineResult:
         """Prune, fill and optimise until the losses settle or the budget is spent."""
         pruned = filled = 0
-        if not self._done:
+        if not self._done and self._remove:
             pruned, filled = self._prepare()
         settled, saved = 0, time.monotonic()
-        once_more = self._done < _AGAIN_AT * self._budget
-        while self._done < self._budget and settled < _SETTLED_PASSES:
-            loss, gain = self._pass(min(self._steps_per_pass, self._budget - self._done))
+        once_more = self._remove and self._done < _AGAIN_AT * self._budget
+        while self._done < self._last and settled < _SETTLED_PASSES:
+            loss, gain = self._pass(min(self._steps_per_pass, self._last - self._done))
             pruned += self._prune_faded()
-            share = _PREPARED + (0.98 - _PREPARED) * self._done / self._budget
+            spent = (self._done - self._first) / (self._last - self._first)
+            share = _PREPARED + (0.98 - _PREPARED) * spent
             self._progress(share, f"refined {self._done} of {self._budget} steps: {loss:.4f}")
             settled = settled + 1 if gain < self._config.converged else 0
             if self._checkpoint is not None and time.monotonic() - saved > _CHECKPOINT_S:
@@ -150,6 +156,8 @@ class FineStage:
         )
 
     def _prune_faded(self) -> int:
+        if not self._remove:
+            return 0
         return self._keep(self._optimiser.gaussians().opacities >= self._config.prune_opacity)
 
     def _prune_unseen(self, share: float) -> int:

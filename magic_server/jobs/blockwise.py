@@ -1,26 +1,26 @@
-"""A merge of several blocks as jobs of their own: one plans, two are each block's, one joins.
+"""A merge of several blocks as jobs of their own: one plans, each round has one of each block, one
+joins.
 
-A block is first refined beside the sub-maps around it and then, shortly, beside its refined
-neighbours. Within a round it needs nothing of other blocks, so they may run anywhere, in any order,
-and again.
+Within a round a block needs nothing of the others, so they may run anywhere, in any order, and
+again (magic_server/globalmap/rounds.py).
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magic_server.jobs.attempt import Attempt
-from magic_server.jobs.delivery import Delivery, JobFile, SpacedReports
+from magic_server.jobs.delivery import Delivery, JobFile, SpacedReports, spaced_keeping
 from magic_server.jobs.tasks import MergeOutcome, PlacedFiles, StoredSource, write_map
 from magic_server.store.blob_store import StreamedFile
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from magic_server.globalmap import MergeConfig
     from magic_server.globalmap.blocks import Block
     from magic_server.globalmap.parts import Parts
+    from magic_server.globalmap.rounds import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,31 +63,57 @@ class BlockTask:
     threads: int
     """Threads of the rasteriser; 0 for one per core."""
     delivery: Delivery
+    until: float
+    """The share of the schedule at which it ends."""
 
 
 @dataclass(frozen=True, slots=True)
-class TouchTask:
-    """A refined block to refine once more beside its neighbours."""
+class RefinedBlocks:
+    """What the blocks of a round made, as far as a job wants it."""
+
+    own: Mapping[int, StreamedFile]
+    """Of each block its own Gaussians, in the lossless layout."""
+    handed: Sequence[StreamedFile]
+    """What others made of them (`consensus.encode`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class BesideTask:
+    """A block to refine further beside its neighbours."""
 
     block: BlockTask
-    """As in the first round, but for where it delivers."""
-    own: StreamedFile
-    neighbours: tuple[StreamedFile, ...]
+    number: int
+    begin: float
+    """The share of the schedule at which it begins."""
+    around: RefinedBlocks
+    """This block and those near it after the round before."""
 
 
 @dataclass(frozen=True, slots=True)
-class BlockOutcome:
-    """A refined block: its Gaussians in the lossless layout."""
+class MadeFile:
+    """A file of a job's that other jobs read."""
 
     file: JobFile
     sha256: str
 
 
 @dataclass(frozen=True, slots=True)
-class JoinTask:
-    """Refined blocks that become one map."""
+class BlockOutcome:
+    """What a block's job made."""
 
-    blocks: tuple[StreamedFile, ...]
+    own: MadeFile
+    """Its Gaussians in the lossless layout."""
+    handed: MadeFile | None
+    """What it made of others' (`consensus.encode`); None where it saw none."""
+
+
+@dataclass(frozen=True, slots=True)
+class JoinTask:
+    """Blocks after the last round, which become one map."""
+
+    blocks: tuple[RefinedBlocks, ...]
+    """Each with what others made of it."""
+    config: MergeConfig
     delivery: Delivery
 
 
@@ -124,32 +151,50 @@ def _planned(block: Block, extents: list[tuple[np.ndarray, np.ndarray] | None]) 
 def refine_block(task: BlockTask) -> BlockOutcome:
     """Refine a block. A folder in which the same block was begun is taken up where it was."""
     config = _with_threads(task)
-    from magic_server.globalmap import merge
+    from magic_server.globalmap import rounds
 
     sources = [StoredSource.of(item) for item in task.submaps]
-    with _at_work(task, sources, config, "refined") as (parts, report):
-        merge.refine_block(task.block, parts, sources, config, progress=report)
-        return _delivered(parts, task.delivery)
+
+    def refine(parts: Parts, report: Progress) -> None:
+        rounds.refine_alone(task.block, parts, sources, config, until=task.until, progress=report)
+
+    return _outcome(task, 0, _named(task.block, sources, config, f"alone {task.until}"), refine)
 
 
-def touch_up_block(task: TouchTask) -> BlockOutcome:
-    """Refine a block once more beside its neighbours; one of these in memory at a time."""
-    block = task.block
+def refine_block_beside(task: BesideTask) -> BlockOutcome:
+    """Refine a block further; taken up where it was like the first round."""
+    block, number = task.block, task.number
     config = _with_threads(block)
-    from magic_core.gaussians import codec
-    from magic_server.globalmap import merge
-
-    def cloud(file: StreamedFile) -> GaussianCloud:
-        return codec.decode(b"".join(file.pieces()))
+    from magic_server.globalmap import rounds
 
     sources = [StoredSource.of(item) for item in block.submaps]
-    beside = " ".join(file.sha256 for file in (task.own, *task.neighbours))
-    with _at_work(block, sources, config, f"touched {beside}") as (parts, report):
-        merge.touch_up(
-            block.block, cloud(task.own), map(cloud, task.neighbours), parts, sources, config,
-            progress=report,
+    files = chain(task.around.own.values(), task.around.handed)
+    what = " ".join([f"beside {task.begin} {block.until}", *(file.sha256 for file in files)])
+
+    def refine(parts: Parts, report: Progress) -> None:
+        rounds.refine_beside(
+            block.block, dict(_agreed(task.around)), parts, sources, config, number=number,
+            span=(task.begin, block.until), progress=report,
         )  # fmt: skip
-        return _delivered(parts, block.delivery)
+
+    return _outcome(block, number, _named(block.block, sources, config, what), refine)
+
+
+def _agreed(refined: RefinedBlocks) -> Iterator[tuple[int, GaussianCloud]]:
+    """The blocks as all agree on them, one at a time."""
+    from magic_core.gaussians import codec
+    from magic_server.globalmap import consensus, rounds
+
+    def content(file: StreamedFile) -> bytes:
+        return b"".join(file.pieces())
+
+    numbers = list(refined.own)
+    handed = (consensus.decode(content(file), owners=numbers) for file in refined.handed)
+    return rounds.agreed_blocks(
+        numbers,
+        lambda number: codec.decode(content(refined.own[number])),
+        chain.from_iterable(handed),
+    )
 
 
 def _with_threads(task: BlockTask) -> MergeConfig:
@@ -160,13 +205,14 @@ def _with_threads(task: BlockTask) -> MergeConfig:
     return config if config.threads else dataclasses.replace(config, threads=threads)
 
 
-@contextlib.contextmanager
-def _at_work(
-    task: BlockTask, sources: list[StoredSource], config: MergeConfig, what: str
-) -> Iterator[tuple[Parts, Callable[[float, str], None]]]:
-    """The job's folder as one of parts, of which it makes the first, and whom to tell."""
-    from magic_server.globalmap.parts import Parts, fingerprint_of
+def _outcome(
+    task: BlockTask, number: int, name: str, refine: Callable[[Parts, Progress], None]
+) -> BlockOutcome:
+    """What a block's job of this name makes, or made when it was tried before."""
+    from magic_server.globalmap.parts import Parts, files_of
 
+    if (before := task.delivery.concluded(name)) is not None:
+        return _block_outcome([MadeFile(file, file.sha256) for file in before])
     with task.delivery.working() as folder:
         attempt, tell = Attempt(folder), SpacedReports(task.delivery)
 
@@ -174,40 +220,54 @@ def _at_work(
             attempt.report(share, stage)
             tell(share, stage)
 
-        name = f"{fingerprint_of(sources, config)} {_name_of(task.block)} {what}"
-        yield Parts(folder, name), report
+        saved = spaced_keeping(task.delivery, lambda: files_of(folder))
+        parts = Parts(folder, name, saved=saved)
+        refine(parts, report)
+        paths = [parts.path(number), parts.guests_path(number)]
+        made = [_made(path, task.delivery) for path in paths if path.is_file()]
+    task.delivery.conclude(name, [one.file for one in made])
+    return _block_outcome(made)
 
 
-def _delivered(parts: Parts, delivery: Delivery) -> BlockOutcome:
-    path = parts.path(0)
+def _block_outcome(made: Sequence[MadeFile]) -> BlockOutcome:
+    own, *handed = made
+    return BlockOutcome(own, handed[0] if handed else None)
+
+
+def _made(path: Path, delivery: Delivery) -> MadeFile:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return BlockOutcome(delivery.deliver(path), digest)
+    return MadeFile(delivery.deliver(path), digest)
 
 
-def _name_of(block: Block) -> str:
+def _named(block: Block, sources: list[StoredSource], config: MergeConfig, what: str) -> str:
+    """A name that no job with another outcome has."""
+    from magic_server.globalmap.parts import fingerprint_of
+
     digest = hashlib.sha256(repr([(v.source, v.keyframe) for v in block.views]).encode())
     for corner in (block.low, block.high, block.reach_low, block.reach_high):
         digest.update(corner.astype("<f8").tobytes())
-    return digest.hexdigest()
+    return f"{fingerprint_of(sources, config)} {digest.hexdigest()} {what}"
 
 
 def join_blocks(task: JoinTask) -> MergeOutcome:
     """Write the map of refined blocks in every format, with one of them in memory at a time."""
     from magic_core.gaussians import codec
+    from magic_server.globalmap import rounds
 
     with task.delivery.working() as folder:
         attempt = Attempt(folder)
         with tempfile.TemporaryDirectory(prefix="joining-", dir=folder) as temporary:
-            paths = []
+            paths, count = [], 0
             for number, block in enumerate(task.blocks):
                 attempt.report(number / len(task.blocks), "joining blocks")
+                ((_, cloud),) = _agreed(block)
+                cloud = rounds.visible(cloud, task.config)
+                count += len(cloud)
                 paths.append(Path(temporary) / f"{number}.mgsc")
-                with paths[-1].open("wb") as file:
-                    file.writelines(block.pieces())
+                paths[-1].write_bytes(codec.encode_lossless(cloud))
 
             def pieces() -> Iterator[GaussianCloud]:
                 return (codec.decode(path.read_bytes()) for path in paths)
 
-            count = sum(len(cloud) for cloud in pieces())
             return write_map(pieces, count, folder=folder, attempt=attempt, delivery=task.delivery)

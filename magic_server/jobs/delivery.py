@@ -3,18 +3,21 @@
 A merge and a preview make files of any size and say how far they are. Where the job runs beside
 the server, or shares its data folder, they are made in a folder of the server's. Where all that
 both reach is a bucket, the job works in a folder of its own, which is gone afterwards, and leaves
-its files in the bucket.
+its files in the bucket; there it also leaves how far it was, for whoever begins it again.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
+import logging
 import shutil
+import tarfile
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +27,17 @@ from magic_core.errors import MagicError, NotFound
 from magic_server.store import Store, WrittenBlob
 from magic_server.store.blob_store import StreamedFile
 from magic_server.store.blobs import LocalFile
-from magic_server.store.bucket import BucketFile, Delivered, delete, put_file, whole
+from magic_server.store.bucket import (
+    BucketFile,
+    Delivered,
+    delete,
+    object_pieces,
+    put_file,
+    whole,
+)
 from magic_server.store.bucket_client import BucketPlace, client_of
+
+logger = logging.getLogger(__name__)
 
 JobFile = Path | Delivered
 """A file that a job made, as the server finds it."""
@@ -33,7 +45,9 @@ Progress = tuple[float, str]
 """Share done, and stage."""
 POLL_S = 0.25
 _PROGRESS = "progress.json"
+_KEPT, _CONCLUDED = "kept.tar", "concluded.json"
 _FAR_PROGRESS_S = 2.0
+_FAR_KEEP_S = 60.0
 
 
 class OpenFile(Protocol):
@@ -53,11 +67,23 @@ class Delivery(Protocol):
 
     @contextmanager
     def working(self) -> Iterator[Path]:
-        """The job's folder, for a block."""
+        """The job's folder, for a block, with what an earlier try kept."""
+        ...
+
+    def keep(self, paths: Sequence[Path]) -> None:
+        """Let a later try find these files of that folder, and none that were kept before."""
         ...
 
     def deliver(self, path: Path) -> JobFile:
         """Hand over a file of that folder."""
+        ...
+
+    def conclude(self, name: str, files: Sequence[JobFile]) -> None:
+        """Let a later try at the job of this name find what it delivered."""
+        ...
+
+    def concluded(self, name: str) -> Sequence[Delivered] | None:
+        """What an earlier try at the job of this name delivered, where it came to its end."""
         ...
 
     def report(self, progress: Progress) -> None:
@@ -81,12 +107,21 @@ class FolderDelivery:
 
     @contextmanager
     def working(self) -> Iterator[Path]:
-        """The job's folder, for a block."""
+        """The job's folder, for a block, with what an earlier try kept."""
         yield self.folder
+
+    def keep(self, paths: Sequence[Path]) -> None:
+        """Nothing: they lie in the folder."""
 
     def deliver(self, path: Path) -> JobFile:
         """Hand over a file of that folder."""
         return path
+
+    def conclude(self, name: str, files: Sequence[JobFile]) -> None:
+        """Nothing: a later try finds the files themselves."""
+
+    def concluded(self, name: str) -> Sequence[Delivered] | None:
+        """None: a later try looks into the folder."""
 
     def report(self, progress: Progress) -> None:
         """Nothing: the server reads it in the folder."""
@@ -104,20 +139,50 @@ class FolderDelivery:
 
 @dataclass(frozen=True, slots=True)
 class BucketDelivery:
-    """Through a bucket. A job that is tried again begins anew."""
+    """Through a bucket."""
 
     place: BucketPlace
     beginning: str
     """Of the keys that this job may write; it ends in a slash."""
     scratch: Path
     """A folder in which the job may work, on whichever machine it runs."""
+    lasting: bool = False
+    """Whether it keeps anything for a later try."""
 
     @contextmanager
     def working(self) -> Iterator[Path]:
-        """The job's folder, for a block."""
+        """The job's folder, for a block, with what an earlier try kept."""
         self.scratch.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="job-", dir=self.scratch) as folder:
+            if self.lasting:
+                self._restore(Path(folder))
             yield Path(folder)
+
+    def keep(self, paths: Sequence[Path]) -> None:
+        """Let a later try find these files of that folder, and none that were kept before.
+
+        A bucket that is away does not end the job: it keeps them the next time.
+        """
+        client = client_of(self.place)
+        with suppress(MagicError), tempfile.NamedTemporaryFile(dir=self.scratch) as file:
+            with tarfile.open(fileobj=file, mode="w") as tar:
+                for path in paths:
+                    tar.add(path, path.name)
+            file.flush()
+            put_file(client, Path(file.name), f"{self.beginning}{_KEPT}")
+
+    def _restore(self, folder: Path) -> None:
+        with suppress(NotFound), tempfile.TemporaryFile(dir=self.scratch) as file:
+            for piece in object_pieces(client_of(self.place), f"{self.beginning}{_KEPT}"):
+                file.write(piece)
+            file.seek(0)
+            try:
+                with tarfile.open(fileobj=file, mode="r") as tar:
+                    tar.extractall(folder, filter="data")
+            except tarfile.TarError:
+                logger.warning("what %s kept is damaged; it begins anew", self.beginning)
+                for path in folder.iterdir():
+                    path.unlink()
 
     def deliver(self, path: Path) -> JobFile:
         """Hand over a file of that folder."""
@@ -127,6 +192,22 @@ class BucketDelivery:
         key = f"{self.beginning}{uuid.uuid4().hex}"
         put_file(client_of(self.place), path, key)
         return Delivered(key, digest, path.stat().st_size)
+
+    def conclude(self, name: str, files: Sequence[JobFile]) -> None:
+        """Let a later try at the job of this name find what it delivered."""
+        found = [dataclasses.asdict(file) for file in files if isinstance(file, Delivered)]
+        data = json.dumps({"name": name, "files": found}).encode()
+        client = client_of(self.place)
+        path = self.place.path(f"{self.beginning}{_CONCLUDED}")
+        client.run("put", client.files._pipe_file(path, data))
+
+    def concluded(self, name: str) -> Sequence[Delivered] | None:
+        """What an earlier try at the job of this name delivered, where it came to its end."""
+        try:
+            said = json.loads(whole(client_of(self.place), f"{self.beginning}{_CONCLUDED}"))
+        except NotFound:
+            return None
+        return [Delivered(**file) for file in said["files"]] if said["name"] == name else None
 
     def report(self, progress: Progress) -> None:
         """Say how far the job is; a bucket that is away does not end it."""
@@ -158,13 +239,23 @@ class Deliveries:
         self.poll_s = POLL_S if self._bucket is None else _FAR_PROGRESS_S
         """How often to ask for progress."""
 
-    def of(self, folder: Path) -> Delivery:
-        """That of a job which, were it here, would work in this folder below the scratch."""
+    def of(self, folder: Path, *, lasting: bool = False) -> Delivery:
+        """That of a job which, were it here, would work in this folder below the scratch.
+
+        What a `lasting` one leaves in a bucket stays over a start of the server, whichever it is.
+        """
         if self._bucket is None:
             return FolderDelivery(folder)
         job = folder.relative_to(self._store.scratch).as_posix()
         scratch = self._store.folder / "jobs"
-        return BucketDelivery(self._bucket.place, self._bucket.beginning_of(job), scratch)
+        beginning = self._bucket.beginning_of(job, lasting=lasting)
+        return BucketDelivery(self._bucket.place, beginning, scratch, lasting)
+
+    def lasting(self) -> set[str]:
+        """The folders, by name, of which lasting jobs left something in the bucket."""
+        if self._bucket is None:
+            return set()
+        return self._bucket.lasting_jobs()
 
     def adoptable(self, file: Delivered) -> WrittenBlob:
         """What a job left in the bucket, for the store to adopt."""
@@ -198,6 +289,19 @@ class SpacedReports:
         if time.monotonic() - self._at >= _FAR_PROGRESS_S:
             self._at = time.monotonic()
             self._delivery.report((share, stage))
+
+
+def spaced_keeping(delivery: Delivery, paths: Callable[[], Sequence[Path]]) -> Callable[[], None]:
+    """Keeps files when it is called, and not more often than a bucket should take them."""
+    kept = time.monotonic()
+
+    def keep() -> None:
+        nonlocal kept
+        if time.monotonic() - kept >= _FAR_KEEP_S:
+            delivery.keep(paths())
+            kept = time.monotonic()
+
+    return keep
 
 
 def _parsed(data: bytes) -> Progress | None:

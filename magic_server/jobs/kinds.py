@@ -27,13 +27,14 @@ class JobKind:
 KINDS = {
     "localize_image": JobKind(40, patient=False),
     "solve_pose_graph": JobKind(30),
+    "settle_pose_graph": JobKind(30),
     "verify_loop": JobKind(20),
     "make_excerpt": JobKind(15, patient=False),
     "append_submaps": JobKind(10, patient=False),
     "merge_submaps": JobKind(0, refines=True),
     "plan_merge": JobKind(0, refines=True),
     "refine_block": JobKind(0, refines=True),
-    "touch_up_block": JobKind(0, refines=True),
+    "refine_block_beside": JobKind(0, refines=True),
     "join_blocks": JobKind(0, refines=True),
 }
 OTHER = JobKind(20)

@@ -18,7 +18,13 @@ from magic_core.geometry import Camera
 from magic_core.geometry.seams import NO_SEAMS, Seams
 from magic_core.wire import geometry, images
 from magic_server.jobs.attempt import Attempt, made_whole
-from magic_server.jobs.delivery import Delivery, FolderDelivery, JobFile, SpacedReports
+from magic_server.jobs.delivery import (
+    Delivery,
+    FolderDelivery,
+    JobFile,
+    SpacedReports,
+    spaced_keeping,
+)
 from magic_server.seams import shares_of
 from magic_server.store.rows import StoredSubmap
 
@@ -224,8 +230,8 @@ def solve_pose_graph(graph: GraphArrays, config: PoseGraphConfig) -> ArraySoluti
 def merge_submaps(task: MergeTask) -> MergeOutcome:
     """Merge placed sub-maps and write the map in every format.
 
-    One block of the map is in memory at a time. A folder of the server's that an interrupted merge
-    of the same sub-maps left is taken up where it was.
+    One block of the map is in memory at a time. What an interrupted merge of the same sub-maps left
+    is taken up where it was.
     """
     with task.delivery.working() as folder:
         return _merged(task, folder)
@@ -235,6 +241,7 @@ def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
     threads = task.threads or os.cpu_count() or 1
     os.environ["MAGIC_THREADS"] = str(threads)
     from magic_server.globalmap.merge import merge_into
+    from magic_server.globalmap.parts import files_of
 
     attempt, tell = Attempt(folder), SpacedReports(task.delivery)
 
@@ -246,7 +253,8 @@ def _merged(task: MergeTask, folder: Path) -> MergeOutcome:
     if not config.threads:
         config = dataclasses.replace(config, threads=threads)
     sources = [StoredSource.of(item) for item in task.submaps]
-    parts, summary = merge_into(folder, sources, config, progress=report)
+    saved = spaced_keeping(task.delivery, lambda: files_of(folder))
+    parts, summary = merge_into(folder, sources, config, progress=report, saved=saved)
     pieces = functools.partial(parts.clouds, summary.blocks)
     return write_map(
         pieces, summary.gaussians, folder=folder, attempt=attempt, delivery=task.delivery

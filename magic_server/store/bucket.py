@@ -2,6 +2,7 @@
 
     {prefix}/blobs/{first hex digit}/{sha256 in hex}   complete, never changed
     {prefix}/incoming/{server}/{random}                on their way in; emptied at every start
+    {prefix}/jobs/{job}/...                            what jobs leave that outlast a server
     {prefix}/database-id                               whose blobs these are
 
 What agents send is spooled in the data folder until the sub-map is whole, then put here; archives
@@ -45,6 +46,7 @@ _LOOKED_UP = 256
 _ABANDONED = timedelta(days=1)
 _ID_KEY = "database-id"
 _CACHE = "blob-cache"
+_JOBS = "jobs/"
 _INVALID_RANGE = ("InvalidRange", "416")
 
 
@@ -148,10 +150,9 @@ class BucketFile:
 
     def pieces(self) -> Iterator[bytes]:
         """All of it in order. NotFound without it, CorruptData when it is not what it was."""
-        client, digest, offset = client_of(self.place), hashlib.sha256(), 0
-        while piece := _read_piece(client, self.key, offset, self.place.part_bytes):
+        digest = hashlib.sha256()
+        for piece in object_pieces(client_of(self.place), self.key):
             digest.update(piece)
-            offset += len(piece)
             yield piece
         if digest.hexdigest() != self.sha256:
             raise CorruptData(_damage(self.place, self.key))
@@ -249,9 +250,15 @@ class BucketBlobs:
         """Begin a new blob."""
         return StagedBlob(self._client, f"{self._incoming}{uuid.uuid4().hex}")
 
-    def beginning_of(self, job: str) -> str:
-        """Of the keys that a job of this name may write; a start of the server removes them."""
-        return f"{self._incoming}{job}/"
+    def beginning_of(self, job: str, *, lasting: bool) -> str:
+        """Of the keys that a job of this name may write; a start of the server removes them, those
+        of a `lasting` one only as it is asked to."""
+        return f"{_JOBS if lasting else self._incoming}{job}/"
+
+    def lasting_jobs(self) -> set[str]:
+        """First part of the names of all lasting jobs that left something."""
+        found = listed(self._client, _JOBS)
+        return {key.removeprefix(_JOBS).partition("/")[0] for key, _ in found}
 
     def delivered(self, file: Delivered) -> DeliveredBlob:
         """What a job left, for `adopt`."""
@@ -449,6 +456,14 @@ def _read(client: BucketClient, sha256: str) -> bytes:
 def whole(client: BucketClient, key: str) -> bytes:
     """All of an object, unchecked; NotFound without it."""
     return client.run("get", client.files._cat_file(client.place.path(key), max_concurrency=1))
+
+
+def object_pieces(client: BucketClient, key: str) -> Iterator[bytes]:
+    """All of an object in order, unchecked; NotFound without it."""
+    offset = 0
+    while piece := _read_piece(client, key, offset, client.place.part_bytes):
+        offset += len(piece)
+        yield piece
 
 
 def _read_piece(client: BucketClient, key: str, offset: int, length: int) -> bytes:

@@ -123,6 +123,33 @@ def test_within_a_block_it_goes_on_from_the_last_checkpoint(tmp_path, monkeypatc
     assert not list(tmp_path.glob("open_*"))
 
 
+def test_within_a_later_round_it_goes_on_from_the_last_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr("magic_server.globalmap.refine._CHECKPOINT_S", 0.0)
+    monkeypatch.setattr("magic_server.globalmap.refine._MIN_STEPS_PER_PASS", 10)
+    placed = [submap(0, -0.6, -0.3), submap(1, 0.6, 0.3)]
+    config = replace(CONFIG, block_views=2, iterations=100, passes=100, converged=0.0)
+
+    class Cut(Exception):
+        """The server is killed."""
+
+    def cut_late(share: float, text: str) -> None:
+        if text.startswith("border of block 1 ") and "refined 80 of 100" in text:
+            raise Cut
+
+    with pytest.raises(Cut):
+        merge_into(tmp_path, placed, config, progress=cut_late)
+    assert (tmp_path / "round-1" / "open_0000.json").is_file()
+    heard: list[str] = []
+    _, summary = merge_into(
+        tmp_path, placed, config, progress=lambda share, text: heard.append(text)
+    )
+    first = [text for text in heard if text.startswith("border of block 1 ")]
+    assert not any("refined 70 of" in text for text in first)
+    assert any("refined 80 of" in text for text in first)
+    assert summary.iterations == 200
+    assert not list(tmp_path.glob("**/open_*"))
+
+
 def test_exposure_of_a_keyframe_is_found_and_undone():
     colour, depth = render(CAMERA, look(0.0, -0.8, 0.0))
     gain, offset = np.array([1.3, 0.8, 1.1]), np.array([-0.05, 0.04, 0.0])

@@ -12,6 +12,7 @@ import pytest
 from magic_core.errors import CorruptData, Unavailable
 from magic_core.tracing import TracingConfig
 from magic_server.jobs import JobConfig, JobExecutor, new_executor
+from magic_server.jobs.delivery import BucketDelivery
 from magic_server.store import BlobWriter
 from magic_server.store.bucket import BucketBlob, BucketBlobs, bucket_of
 from magic_server.store.bucket_client import BucketPlace
@@ -78,3 +79,62 @@ async def test_a_worker_that_the_bucket_does_not_let_in_is_given_no_jobs(
 
 def localize_image() -> None:
     """A job that is impatient, by its name."""
+
+
+def lasting(place: BucketPlace, machine: Path) -> BucketDelivery:
+    return BucketDelivery(place, "jobs/merge-7/block-0001/", machine, lasting=True)
+
+
+def test_another_machine_goes_on_with_what_a_job_kept(place: BucketPlace, tmp_path: Path) -> None:
+    with lasting(place, tmp_path / "one").working() as folder:
+        assert not list(folder.iterdir())
+        for name, text in (("plan.json", "plan"), ("open_0000.json", "half"), ("not", "kept")):
+            (folder / name).write_text(text)
+        lasting(place, tmp_path / "one").keep([folder / "plan.json", folder / "open_0000.json"])
+    with lasting(place, tmp_path / "two").working() as folder:
+        assert {path.name: path.read_text() for path in folder.iterdir()} == {
+            "plan.json": "plan",
+            "open_0000.json": "half",
+        }
+        (folder / "plan.json").write_text("another plan")
+        lasting(place, tmp_path / "two").keep([folder / "plan.json"])
+    with lasting(place, tmp_path / "one").working() as folder:
+        assert [path.read_text() for path in folder.iterdir()] == ["another plan"]
+
+
+def test_keeping_nothing_new_while_the_bucket_is_away_does_not_end_a_job(
+    bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
+) -> None:
+    delivery = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
+    with delivery.working() as folder:
+        (folder / "plan.json").write_text("plan")
+        with bucket_server.away():
+            delivery.keep([folder / "plan.json"])
+        (folder / "plan.json").write_text("later")
+        delivery.keep([folder / "plan.json"])
+    with delivery.working() as folder:
+        assert (folder / "plan.json").read_text() == "later"
+
+
+def test_what_was_kept_and_is_damaged_is_not_gone_on_with(
+    bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
+) -> None:
+    delivery = lasting(place, tmp_path / "one")
+    bucket_server.files().pipe_file(place.path(f"{delivery.beginning}kept.tar"), b"no tar" * 200)
+    with delivery.working() as folder:
+        assert not list(folder.iterdir())
+
+
+def test_a_job_that_came_to_its_end_is_found_by_its_name_alone(
+    place: BucketPlace, tmp_path: Path
+) -> None:
+    delivery = lasting(place, tmp_path / "one")
+    assert delivery.concluded("block as planned") is None
+    with delivery.working() as folder:
+        (folder / "block").write_bytes(b"refined")
+        file = delivery.deliver(folder / "block")
+    delivery.conclude("block as planned", [file])
+    assert delivery.concluded("block as planned") == [file]
+    assert delivery.concluded("block under other poses") is None
+    delivery.clear()
+    assert delivery.concluded("block as planned") is None

@@ -1,4 +1,4 @@
-"""A merge of several blocks as jobs of their own: resumed, run again, given up, seamless enough."""
+"""A merge of several blocks as jobs of their own: resumed, run again, given up."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from magic_core.gaussians import GaussianCloud
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.globalmap import MergeConfig, PlacedSubmap
 from magic_server.globalmap.blocks import blocks_near, places_of, plan_blocks
-from magic_server.globalmap.merge import build_global_map, refine_block, touch_up
+from magic_server.globalmap.merge import build_global_map
 from magic_server.globalmap.parts import Parts
+from magic_server.globalmap.rounds import agreed_blocks, refine_alone, refine_beside
 from magic_server.jobs import JobConfig
 from magic_server.preview_config import PreviewConfig
 from magic_server.server import Server
+from magic_server.store.bucket import bucket_of, listed, whole
+from magic_server.store.bucket_client import client_of
 from tests.cluster import running_cluster
 from tests.server.test_globalmap_merge import submap
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
@@ -62,16 +65,21 @@ def jobs_of(server: Server, *, blocks: int = 1000) -> list[str]:
     return names
 
 
-def done_blocks(config: ServerConfig) -> dict[str, int]:
-    """The blocks that are done, and when each was written."""
-    found = {}
-    for file in config.data_dir.glob("**/merge-*/b*-*/block_0000.json"):
+def done_blocks(config: ServerConfig) -> dict[str, object]:
+    """The blocks that are done, each with what would be another if it were refined again."""
+    place = bucket_of(config.store, config.data_dir)
+    if place is not None and config.jobs.executor != "pool":
+        client = client_of(place)
+        keys = [key for key, _ in listed(client, "jobs/") if key.endswith("/concluded.json")]
+        return {key.split("/")[-2]: whole(client, key) for key in keys}
+    found: dict[str, object] = {}
+    for file in config.data_dir.glob("**/merge-*/b*-*/block_*.json"):
         with contextlib.suppress(FileNotFoundError):  # the merge may just have ended
             found[file.parent.name] = file.stat().st_mtime_ns
     return found
 
 
-async def first_block(config: ServerConfig) -> dict[str, int]:
+async def first_block(config: ServerConfig) -> dict[str, object]:
     """The blocks that are done, once one is."""
     async with asyncio.timeout(300.0):
         while not (done := done_blocks(config)):  # noqa: ASYNC110
@@ -80,7 +88,7 @@ async def first_block(config: ServerConfig) -> dict[str, int]:
 
 
 async def watched(
-    client: MagicClient, config: ServerConfig, name: str, before: dict[str, int]
+    client: MagicClient, config: ServerConfig, name: str, before: dict[str, object]
 ) -> None:
     """Wait for a map; no block that is done is refined again."""
     kept = dict(before)
@@ -101,18 +109,23 @@ def test_blocks_refined_in_any_order_are_the_same_map(tmp_path: Path):
     found = []
     for folder, order in (("forward", 1), ("backward", -1)):
         parts = Parts(tmp_path / folder, "the same")
-        touched = parts.beside("touched")
+        beside = parts.beside("beside")
         numbers = list(range(len(blocks)))[::order]
         for number in numbers:
-            refine_block(blocks[number], parts, placed, CONFIG, number=number, progress=silent)
+            refine_alone(
+                blocks[number], parts, placed, CONFIG, number=number, until=0.5, progress=silent
+            )
         for number in numbers:
-            near = blocks_near(blocks, number)
-            assert near
-            touch_up(
-                blocks[number], parts.cloud(number), [parts.cloud(other) for other in near],
-                touched, placed, CONFIG, number=number, progress=silent,
+            around = {other: parts.cloud(other) for other in blocks_near(blocks, number)}
+            assert around
+            refine_beside(
+                blocks[number], {number: parts.cloud(number), **around}, beside, placed, CONFIG,
+                number=number, span=(0.5, 1.0), progress=silent,
             )  # fmt: skip
-        found.append(GaussianCloud.concatenate(list(touched.clouds(len(blocks)))))
+        handed = [g for n in numbers for g in beside.guests(n, owners=range(len(blocks)))]
+        assert handed
+        made = agreed_blocks(range(len(blocks)), beside.cloud, handed)
+        found.append(GaussianCloud.concatenate([cloud for _, cloud in made]))
     assert len(found[0]) == len(found[1])
     np.testing.assert_allclose(found[0].means, found[1].means, atol=1e-5)
 
@@ -129,7 +142,7 @@ async def test_each_block_is_a_job_and_the_map_is_that_of_one_job(
     shares: list[float] = []
     info = await client.build_global_map("room", progress=lambda share, stage: shares.append(share))
     assert names.count("plan_merge") == names.count("join_blocks") == 1
-    assert names.count("refine_block") == names.count("touch_up_block") >= 3
+    assert names.count("refine_block") == names.count("refine_block_beside") // 2 >= 3
     assert "merge_submaps" not in names
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
@@ -164,8 +177,6 @@ async def test_a_merge_of_one_block_is_one_job(server_config: ServerConfig) -> N
 async def test_a_server_started_again_refines_what_was_not_done(
     server_config: ServerConfig,
 ) -> None:
-    if server_config.store.blobs:
-        pytest.skip("jobs that leave their files in a bucket begin anew")
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await submit(client)
         jobs_of(server, blocks=1)
@@ -175,6 +186,7 @@ async def test_a_server_started_again_refines_what_was_not_done(
     async with Server(server_config) as server, MagicClient(server.address) as client:
         await watched(client, server_config, begun.name, before)
     assert not list(server_config.data_dir.glob("**/merge-*"))
+    assert not done_blocks(server_config)
 
 
 @pytest.mark.slow
