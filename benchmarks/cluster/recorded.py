@@ -78,7 +78,8 @@ async def measure_store(filling: Filling, store: Store) -> dict:
         await store.submaps.page(filling.session, after=after)
         listed.append(time.perf_counter() - started)
     async with store._database.write(filling.session.id) as connection:
-        await connection.execute(sa.update(schema.submaps).values(searched=True))
+        new = schema.submaps.c.id > filling.count - SINGLE
+        await connection.execute(sa.update(schema.submaps).where(new).values(searched=True))
     return {
         "transaction_ms": spread(added),
         "header_ms": spread(read),

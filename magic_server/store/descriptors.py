@@ -161,12 +161,14 @@ class PgvectorPlaces:
         """The `count` sub-maps nearest to a vector."""
         d = self._session.dimension
         half = f"halfvec({d})" if d <= MOST_INDEXED else f"vector({d})"
+        # Subqueries: a prepared statement would read the vector's text again for every row.
         statement = sa.text(
             "WITH candidates AS MATERIALIZED ("
             f"SELECT submap_id, keyframe, embedding FROM {self._table} WHERE session_id = :session "
-            f"ORDER BY embedding::{half} <#> CAST(CAST(:vector AS text) AS {half}) LIMIT :asked), "
+            f"ORDER BY embedding::{half} <#> (SELECT CAST(CAST(:vector AS text) AS {half})) "
+            "LIMIT :asked), "
             "exact AS (SELECT submap_id, keyframe, "
-            f"-(embedding <#> CAST(CAST(:vector AS text) AS vector({d}))) AS similarity "
+            f"-(embedding <#> (SELECT CAST(CAST(:vector AS text) AS vector({d})))) AS similarity "
             "FROM candidates), "
             "best AS (SELECT DISTINCT ON (submap_id) * FROM exact "
             "ORDER BY submap_id, similarity DESC, keyframe) "
