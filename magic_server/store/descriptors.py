@@ -28,6 +28,9 @@ LEAST_VERSION = (0, 8)
 MOST_INDEXED = 4000
 """Numbers of a descriptor in half precision that pgvector can index; longer ones are compared with
 all of their session."""
+MOST_INLINE = 2000
+"""Numbers of a descriptor that fit into a row. PostgreSQL keeps longer ones aside, where comparing
+with all takes three times as long, which its planner does not know."""
 CANDIDATES = 8
 """So many times the neighbours that are asked for are compared exactly."""
 LEAST_CANDIDATES = 200
@@ -70,6 +73,8 @@ class DescriptorTable:
             "keyframe BIGINT NOT NULL DEFAULT 0, PRIMARY KEY (submap_id, keyframe))",
             f"CREATE INDEX IF NOT EXISTS {table}_session ON {table} (session_id)",
         ]
+        if dimension <= MOST_INLINE:
+            statements.append(f"ALTER TABLE {table} ALTER COLUMN embedding SET STORAGE PLAIN")
         if dimension <= MOST_INDEXED:
             statements.append(
                 f"CREATE INDEX IF NOT EXISTS {table}_hnsw ON {table} "

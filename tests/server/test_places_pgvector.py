@@ -52,13 +52,15 @@ def clustered(count: int, seed: int) -> np.ndarray:
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
-async def with_submaps(store: Store, session: str, vectors: np.ndarray) -> SessionRow:
+async def with_submaps(
+    store: Store, session: str, vectors: np.ndarray, *, dimension: int = DIMENSION
+) -> SessionRow:
     """A session whose sub-maps have these descriptors and nothing else."""
     async with store._database.write() as connection:
-        values = {"name": session, "created_at": 1.0, "model_id": "m", "dimension": DIMENSION}
+        values = {"name": session, "created_at": 1.0, "model_id": "m", "dimension": dimension}
         added = await connection.execute(sa.insert(schema.sessions), values)
         assert added.inserted_primary_key is not None
-        row = SessionRow(added.inserted_primary_key[0], session, "m", DIMENSION)
+        row = SessionRow(added.inserted_primary_key[0], session, "m", dimension)
         await store._database.began(connection, row.id)
         agent = {"session_id": row.id, "name": "a", "finished": False}
         agent |= {"registered_at": 1.0, "last_seen_at": 1.0}
@@ -233,6 +235,27 @@ async def test_a_table_of_the_build_before_takes_keyframes_after_its_revision(
             await index.load(places)
             found = await index.nearest(-vectors[2:3], 1)
             assert [(hit.name, hit.keyframe) for hit in found] == [(places[2].name, 1)]
+
+
+async def test_vectors_lie_in_their_rows_as_far_as_they_fit(
+    store: Store, address: str, postgresql: PostgresServer
+) -> None:
+    table = DescriptorTable(store._database)
+    long = descriptors.MOST_INLINE
+    for dimension, kind in ((8, "p"), (long, "p"), (long + 1, "e")):  # plain, external
+        await table.prepare(dimension)
+        row = await with_submaps(store, f"s{dimension}", clustered(1, 1), dimension=dimension)
+        index = store.places(row)
+        assert index is not None
+        vector = np.linspace(-1.0, 1.0, dimension)
+        name = names.submap_name(row.name, "a", 0)
+        await index.add(Place(name, vector))
+        assert [hit.name for hit in await index.nearest(vector[None], 1)] == [name]
+        stored = (
+            "SELECT attstorage FROM pg_attribute "
+            f"WHERE attrelid = 'descriptors_{dimension}'::regclass AND attname = 'embedding'"
+        )
+        assert postgresql.sql(stored, database=address.rpartition("/")[2]) == kind
 
 
 async def test_sessions_prepare_their_table_at_the_same_time(store: Store) -> None:
