@@ -264,7 +264,7 @@ def plot(files: list[Path], out: Path) -> None:
 
     rows = [json.loads(line) for file in files for line in file.read_text().splitlines()]
     rows = [row for row in rows if "part" in row and "limit" not in row]
-    figure, (times, starts, memory) = pyplot.subplots(1, 3, figsize=(14, 4.4))
+    figure, (times, starts, memory) = pyplot.subplots(1, 3, figsize=(14, 5.2))
     for part, kind in sorted({(row["part"], _kind(row)) for row in rows}):
         own = [row for row in rows if (row["part"], _kind(row)) == (part, kind)]
         own.sort(key=lambda row: row["size"])
@@ -275,14 +275,15 @@ def plot(files: list[Path], out: Path) -> None:
             p99 = [row[key]["p99"] for row in own]
             times.loglog(sizes, p99, "_", color=line.get_color(), markersize=12)
         begun = [row[_START[part]] for row in own]
-        starts.loglog(sizes, begun, "o-", label=f"{part}, {kind}")
-        memory.loglog(sizes, [row["mib"] for row in own], "o-", label=f"{part}, {kind}")
+        label = kind if part == "server" else f"{part}, {kind}"
+        starts.loglog(sizes, begun, "o-", label=label)
+        memory.loglog(sizes, [row["mib"] for row in own], "o-", label=label)
     times.set(xlabel="sub-maps", ylabel="ms, p50 (dots) and p99 (bars)")
     starts.set(xlabel="sub-maps", ylabel="s of processor until it is taken up")
     memory.set(xlabel="sub-maps", ylabel="MiB at most")
     for axes in (times, starts, memory):
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+        axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
     figure.tight_layout()
     figure.savefig(out, dpi=90)
 
@@ -296,8 +297,10 @@ _START = {"descriptors": "load_s", "graph": "restore_s", "server": "start_s"}
 
 
 def _kind(row: dict) -> str:
-    if "dimension" in row:
+    if row["part"] == "descriptors":
         return f"{row['dimension']} numbers"
+    if row["part"] == "server":
+        return f"whole server, {row['dimension']} numbers"
     return f"hierarchy {row['hierarchy']}"
 
 
