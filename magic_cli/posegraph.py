@@ -28,8 +28,6 @@ class SolveConfig:
     """g2o files: one graph, or one file per robot of the same graph."""
     robust: Literal["none", "gnc"] = "gnc"
     """`gnc` finds and leaves out wrong loops; `none` trusts every edge."""
-    hierarchy: Literal["auto", "on", "off"] = "auto"
-    """With `gnc`, find the optimum by regions: `auto` does so from 10,000 vertices on."""
     out: Path | None = None
     """Write the solved graph here, as g2o."""
     json: bool = False
@@ -49,9 +47,7 @@ def main(arguments: list[str]) -> int:
     from magic_server.posegraph.solve_files import solve_files
 
     with console.status("solving"):
-        result = solve_files(
-            config.files, robust=config.robust, hierarchy=config.hierarchy, output=config.out
-        )
+        result = solve_files(config.files, robust=config.robust, output=config.out)
     rows = [
         ["vertices / edges", f"{result['vertices']:,} / {result['edges']:,}"],
         ["components", str(result["components"])],

@@ -109,6 +109,7 @@ class SessionCoordinator:
         self._tasks.start(self._search_for_ever(), name="search", detached=True)
         self._tasks.start(self._solving.take_in_for_ever(), name="take in", detached=True)
         self._tasks.start(self._solving.solve_for_ever(), name="solve", detached=True)
+        self._tasks.start(self._solving.condense_for_ever(), name="condense", detached=True)
 
     @property
     def board(self) -> PoseBoard:

@@ -17,7 +17,10 @@ from magic_core.wire import convert, names, records
 from magic_server.bridging import bridged
 from magic_server.posegraph import Edge, PoseGraphConfig, stacked
 from magic_server.posegraph.arrays import ArraySolution
-from magic_server.posegraph.online import Change, NewVertex, OnlineGraph
+from magic_server.posegraph.online import NewVertex, OnlineGraph
+from magic_server.posegraph.regional import Regions
+from magic_server.posegraph.settlement import Optimum
+from magic_server.posegraph.telling import Change
 from magic_server.store import GraphVertex, RemovedSubmap, Vertex
 
 
@@ -138,13 +141,21 @@ class SessionGraph:
             settled=settled and snapshot.loop_count == len(facts.loops),
         )
 
-    def advance(self, solution: ArraySolution | None) -> Change:
-        """Adopt a solve of the whole graph, if there is one, and take in what is new."""
+    def advance(
+        self, solution: ArraySolution | Optimum | None, regions: Regions | None = None
+    ) -> Change:
+        """Adopt a solve of the whole graph and its regions, if there are, and take in what is new.
+
+        Of a large graph's new loops some may be left for the next time.
+        """
         # Loops first: each came after the sub-maps that it joins.
-        loops = [self._new_loops.popleft() for _ in range(len(self._new_loops))]
+        waiting, most = len(self._new_loops), self.online.loops_per_step
+        count = waiting if most is None else min(waiting, most)
+        loops = [self._new_loops.popleft() for _ in range(count)]
         vertices = [self._new_vertices.popleft() for _ in range(len(self._new_vertices))]
         joining = [self._joining(vertex) for vertex in vertices]
-        return self.online.advance(joining, [_loop_edge(loop) for loop in loops], solution)
+        edges = [_loop_edge(loop) for loop in loops]
+        return self.online.advance(joining, edges, solution, regions)
 
     def remember(self, change: Change) -> None:
         """A change is in the store: so are the loops that it took up or dropped."""

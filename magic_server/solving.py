@@ -1,10 +1,12 @@
 """Keeps a session's solution up to date: at once where that is certain, exactly a little later.
 
-Two tasks. One takes in what is new (sub-maps, accepted loops, finished solves), stores the change
-and publishes it as a revision; that takes milliseconds, however large the graph. The other solves
-the whole graph in a worker process whenever something is unsettled, and rests between two solves
-for as long as one took, so that it never takes more than half of a worker. A large graph is kept at
-its optimum by the first (`posegraph.hierarchy`), and only doubt about a loop unsettles it.
+Three tasks. One takes in what is new (sub-maps, accepted loops, finished solves), stores the change
+and publishes it as a revision; that takes milliseconds, however large the graph, or tenths of a
+second where it is condensed by regions (`posegraph.regional`). The second solves the whole graph in
+a worker process whenever something is unsettled, and rests between two solves for as long as one
+took, so that it never takes more than half of a worker: robustly where a loop is in doubt, else
+exactly with what counts. The third condenses a large graph, a bit at a time. Nothing waits for the
+last two: what comes meanwhile is taken in, and carried along when they are done.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import logging
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Executor
+from typing import TypeVar
 
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
@@ -21,14 +24,18 @@ from magic_core import logs, tracing
 from magic_core.errors import DiskFull, Unavailable
 from magic_server.graph import SessionGraph
 from magic_server.jobs import JobExecutor
+from magic_server.jobs.settling import settle_pose_graph
 from magic_server.jobs.tasks import solve_pose_graph
 from magic_server.poseboard import PoseBoard
-from magic_server.posegraph.arrays import ArraySolution
-from magic_server.posegraph.online import Change
+from magic_server.posegraph.arrays import ArraySolution, GraphArrays
 from magic_server.posegraph.problem import PoseGraphConfig
+from magic_server.posegraph.regional import Regions
+from magic_server.posegraph.settlement import CountedArrays, Optimum
+from magic_server.posegraph.telling import Change
 from magic_server.store import SessionRow, Store
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 RETRY_S = 1.0
 MAX_REST_S = 300.0
@@ -62,12 +69,14 @@ class Solving:
         self._threads = threads
         self._config = config
         self._editing = editing
-        self._finished: tuple[int, ArraySolution] | None = None
+        self._finished: tuple[int, ArraySolution | Optimum] | None = None
+        self._condensed: tuple[int, Regions] | None = None
         self._stepping = False
         self._computing = False
         self._journal_bytes = 0
         self._news = asyncio.Event()
         self._unsettled = asyncio.Event()
+        self._uncondensed = asyncio.Event()
         self._on_idle: Callable[[], Awaitable[None]] = _nothing
 
     async def start(self, *, on_idle: Callable[[], Awaitable[None]]) -> None:
@@ -89,7 +98,7 @@ class Solving:
     @property
     def busy(self) -> bool:
         """Whether the solution is not yet what it would be if nothing more came."""
-        waiting = self._graph.has_news or self._finished or self._graph.online.unsettled
+        waiting = self._graph.has_news or self._finished or self._graph.online.wants_solve
         return bool(waiting or self._stepping or self._computing)
 
     async def replace(self, snapshot: mapping_pb.PoseSnapshot | None) -> None:
@@ -97,7 +106,7 @@ class Solving:
         if snapshot is not None:
             self.board.publish(snapshot)
         self._journal_bytes = 0
-        self._finished = None
+        self._finished = self._condensed = None
         await self._restore()
         self.wake()
 
@@ -118,42 +127,91 @@ class Solving:
                 await self._try_again()
             finally:
                 self._stepping = False
-            if self._graph.online.unsettled:
-                self._unsettled.set()
+            self._ask()
             await self._on_idle()
+
+    def _ask(self) -> None:
+        """Wake those whose turn it is."""
+        if self._graph.online.wants_solve:
+            self._unsettled.set()
+        if self._graph.online.is_uncondensed:
+            self._uncondensed.set()
+        if self._graph.has_news:  # it was too much for one step
+            self._news.set()
 
     async def solve_for_ever(self) -> None:
         """Solve the whole graph in a worker, whenever that may change something."""
         while True:
             await self._unsettled.wait()
             self._unsettled.clear()
+            if not self._graph.online.wants_solve:
+                continue
             started = time.perf_counter()
             self._computing = True
+            doubt = True
             try:
                 async with self._editing:
-                    edition = self._graph.edition
-                    arrays = await self._in_thread(self._graph.online.arrays)
+                    edition, doubt = self._graph.edition, self._graph.online.unsettled
+                    arrays = await self._in_thread(self._asked, doubt)
                 with logs.bound(session=self._session.name), tracing.span("solve pose graph"):
-                    solution = await self._jobs.run(solve_pose_graph, arrays, self._config)
+                    if isinstance(arrays, CountedArrays):
+                        solution = await self._jobs.run(settle_pose_graph, arrays)
+                    else:
+                        solution = await self._jobs.run(solve_pose_graph, arrays, self._config)
                 self._finished = edition, solution
                 self._news.set()
             except Exception:
                 # The last solution stays; a worker may be back in a moment.
                 logger.exception("solving the pose graph of %s failed", self._session.name)
-                self._graph.online.unsettled = True
+                self._graph.online.unsettled |= doubt
+                self._graph.online.bent |= not doubt
                 self._unsettled.set()
                 await asyncio.sleep(RETRY_S)
             finally:
                 self._computing = False
             await asyncio.sleep(min(time.perf_counter() - started, MAX_REST_S))
 
+    async def condense_for_ever(self) -> None:
+        """Condense a large graph, a bit at a time, whenever its regions are missing or outgrown."""
+        while True:
+            await self._uncondensed.wait()
+            self._uncondensed.clear()
+            if self._condensed is not None or not self._graph.online.is_uncondensed:
+                continue
+            started = time.perf_counter()
+            try:
+                async with self._editing:
+                    edition = self._graph.edition
+                    outline = await self._in_thread(self._graph.online.outline)
+                regions = await self._in_thread(outline.begin)
+                while not await self._in_thread(regions.go_on):
+                    if edition != self._graph.edition:
+                        break  # deleted meanwhile: it is asked for again
+                else:
+                    self._condensed = edition, regions
+                self._news.set()
+            except Exception:
+                # Without regions, loops go on to move their neighbourhoods.
+                logger.exception("condensing the pose graph of %s failed", self._session.name)
+                self._uncondensed.set()
+                await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(min(time.perf_counter() - started, MAX_REST_S))
+
     async def _take_in(self) -> None:
-        finished, self._finished = self._finished, None
-        usable = finished is not None and finished[0] == self._graph.edition
-        solution = finished[1] if finished is not None and usable else None
-        change = await self._in_thread(self._graph.advance, solution)
+        finished, condensed = self._finished, self._condensed
+        self._finished = self._condensed = None
+        solution = self._usable(finished)
+        change = await self._in_thread(self._graph.advance, solution, self._usable(condensed))
         if change or solution is not None:
             await self._publish(change)
+
+    def _asked(self, doubt: bool) -> GraphArrays | CountedArrays:
+        """What a solve of the whole is to work on."""
+        return self._graph.online.arrays() if doubt else self._graph.online.counted()
+
+    def _usable(self, found: tuple[int, T] | None) -> T | None:
+        """What was found, unless the graph was begun anew since it was asked for."""
+        return found[1] if found is not None and found[0] == self._graph.edition else None
 
     async def _publish(self, change: Change) -> None:
         revision = self.board.revision + 1

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from magic_server.posegraph import stacked
+from magic_server.posegraph import packed, stacked
 from magic_server.posegraph.dissection import Dissection
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 Numbers = NDArray[np.int64]
-_potrf, _trtrs = get_lapack_funcs(("potrf", "trtrs"), dtype=np.float64)
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=np.float64)
 (_trsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
 
 DAMPING = 1e-6
@@ -31,6 +32,8 @@ LIKENESS = 0.002
 """Condensed matrices that differ by less, relative to their diagonals, do for a while."""
 STRAIN_M = 3e-4
 """What lies below separators that bend by less moves as one rigid body."""
+STILL_M = 1e-5
+"""What lies below separators that move by less stays."""
 REACH = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0])
 """Metres that a rotation of one radian moves what is near."""
 
@@ -48,13 +51,17 @@ class Blocks:
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """One eliminated node."""
+    """One eliminated node.
+
+    What steps are solved with may be rounded: together it still is a positive definite matrix.
+    What separators above are made of may not: their softest motions would be lost in it.
+    """
 
     own: Numbers  # (p,) vertices
     above: Numbers  # (b,) vertices of the separators that it touches, ascending
-    factor: Array  # (6p, 6p) lower triangular
-    coupling: Array  # (6p, 6b) factor^-1 of the block between own and above
-    condensed: Array  # (6b, 6b) what it says about the vertices above
+    factor: Single  # 6p x 6p, lower triangle
+    coupling: Single  # (6p, 6b) factor^-1 of the block between own and above
+    condensed: Array  # 6b x 6b, lower triangle: what it says about the vertices above
 
     @property
     def nbytes(self) -> int:
@@ -71,6 +78,16 @@ class Step:
     rigid: tuple[tuple[Numbers, Array], ...]
     """Vertices that move by one motion (4, 4) of the world."""
 
+    @property
+    def moving(self) -> Numbers:
+        """All vertices that move."""
+        return np.concatenate([self.vertices, *(vertices for vertices, _ in self.rigid)])
+
+    def scaled(self, share: float) -> Step:
+        """A share of the step, in its direction."""
+        rigid = ((v, stacked.exp(share * stacked.log(motion[None]))[0]) for v, motion in self.rigid)
+        return Step(self.vertices, share * self.tangents, tuple(rigid))
+
 
 class Fronts:
     """The eliminated nodes of a dissection."""
@@ -78,8 +95,6 @@ class Fronts:
     def __init__(self, tree: Dissection) -> None:
         self._tree = tree
         self._fronts: dict[int, Front] = {}
-        self._untold: dict[int, Array] = {}
-        """The newest condensed matrices of nodes, where the parent goes on with older ones."""
 
     @property
     def nbytes(self) -> int:
@@ -92,95 +107,83 @@ class Fronts:
         blocks: Callable[[int], Blocks],
         held: set[int],
         *,
-        exactly: bool,
-    ) -> None:
-        """Eliminate nodes again, `blocks` being the edges that lie in each, and those above them.
+        upwards: bool = True,
+    ) -> set[int]:
+        """Eliminate nodes again, `blocks` being the edges that lie in each; which ones were.
 
-        Unless `exactly`, nodes above go on with what they were told about those below as long as
-        that has changed little.
+        `upwards`, the nodes above follow as far as what they are told changes: as long as that is
+        little, they go on with what they were told before.
         """
         nodes = self._tree.nodes
-        waiting = set(stale)
-        if exactly:
-            waiting.update(nodes[node].parent for node in self._untold)
-            for node, condensed in self._untold.items():
-                self._fronts[node] = replace(self._fronts[node], condensed=condensed)
-            self._untold.clear()
+        waiting, done = set(stale), set[int]()
         while waiting:
             node = max(waiting, key=lambda n: (nodes[n].depth, n))
             waiting.remove(node)
+            done.add(node)
             before = self._fronts.get(node)
             front = self._eliminated(node, blocks(node), held)
-            self._untold.pop(node, None)
-            if not exactly and before is not None and _is_like(front, before):
-                self._untold[node] = front.condensed
+            if before is not None and _is_like(front, before):
                 front = replace(front, condensed=before.condensed)
-            elif nodes[node].parent >= 0:
+            elif upwards and nodes[node].parent >= 0:
                 waiting.add(nodes[node].parent)
             self._fronts[node] = front
+        return done
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether every node knows the newest about those below it."""
-        return not self._untold
-
-    def step(self, gradient: Mapping[int, Array], poses: Array, held: set[int]) -> Step:
-        """How all vertices move to where a gradient, (6,) by vertex, vanishes."""
+    def step(self, vertices: Numbers, gradient: Array, poses: Array, held: set[int]) -> Step:
+        """How all vertices move to where a gradient (n, 6), zero but at `vertices`, vanishes."""
         tree = self._tree
         holding = {node for vertex in held for node in tree.path(tree.node_of[vertex])}
-        return self._backward(self._forward(gradient), poses, holding)
+        reached = set[int]()
+        for node in {tree.node_of[vertex] for vertex in vertices.tolist()}:
+            while node >= 0 and node not in reached:
+                reached.add(node)
+                node = tree.nodes[node].parent
+        return self._backward(self._forward(reached, gradient), poses, holding)
 
-    def _forward(self, gradient: Mapping[int, Array]) -> dict[int, Array]:
+    def _forward(self, reached: Collection[int], gradient: Array) -> dict[int, Single]:
         """Right-hand sides of the nodes that a gradient reaches, after elimination."""
-        tree, result = self._tree, {}
-        reached = {tree.node_of[vertex] for vertex in gradient}
-        reached.update(*(tree.path(node) for node in tuple(reached)))
-        passed: dict[int, list[tuple[Numbers, Array]]] = {}
-        for node in sorted(reached, key=lambda n: (-tree.nodes[n].depth, n)):
+        nodes, result = self._tree.nodes, {}
+        total = -gradient
+        for node in sorted(reached, key=lambda n: (-nodes[n].depth, n)):
             front = self._fronts[node]
-            rhs = np.zeros((len(front.own) + len(front.above), 6))
-            for row, vertex in enumerate(front.own.tolist()):
-                if vertex in gradient:
-                    rhs[row] = -gradient[vertex]
-            for vertices, values in passed.pop(node, ()):
-                rhs[_places(front, vertices)] += values
-            own = 6 * len(front.own)
-            flat = rhs.ravel()
-            result[node] = solved = flat[:own]
-            if own:
-                result[node], _ = _trtrs(front.factor, solved, lower=1)
-                flat[own:] -= front.coupling.T @ result[node]
+            own = total[front.own].astype(np.float32).ravel()
+            result[node] = solved = packed.solved(front.factor, own)
             if len(front.above):
-                above = flat[own:].reshape(-1, 6)
-                passed.setdefault(tree.nodes[node].parent, []).append((front.above, above))
+                # A vertex is once at most among those above.
+                total[front.above] -= (solved @ front.coupling).reshape(-1, 6)
         return result
 
-    def _backward(self, solved: dict[int, Array], poses: Array, holding: set[int]) -> Step:
-        moves: dict[int, Array] = {}
+    def _backward(self, solved: dict[int, Single], poses: Array, holding: set[int]) -> Step:
+        moves = np.zeros((len(poses), 6))
+        moving: list[Numbers] = []
         rigid: list[tuple[Numbers, Array]] = []
         stack = [0]
         while stack:
             node = stack.pop()
             front = self._fronts[node]
-            above = np.array([moves[v] for v in front.above.tolist()]).reshape(-1, 6)
+            above = moves[front.above]
             if node not in solved and node not in holding:
                 # Nothing below has a gradient either: it would have passed through here. And what
                 # holds a vertex must not drift with its surroundings.
+                if (np.abs(above) * REACH < STILL_M).all():
+                    continue
                 motion = _rigid_motion(above, poses[front.above])
                 if motion is not None:
                     rigid.append((self._below(node), motion))
                     continue
             if len(front.own):
                 rhs = solved.get(node)
-                flat = np.zeros(6 * len(front.own)) if rhs is None else rhs
+                if rhs is None:
+                    rhs = np.zeros(6 * len(front.own), dtype=np.float32)
                 if len(above):
-                    flat = flat - front.coupling @ above.ravel()
-                own, _ = _trtrs(front.factor, flat, lower=1, trans=1)
-                moves.update(zip(front.own.tolist(), own.reshape(-1, 6), strict=True))
+                    bent = front.coupling @ above.astype(np.float32).ravel()
+                    rhs = (rhs - bent).astype(np.float32)
+                own = packed.solved(front.factor, rhs, transposed=True)
+                moves[front.own] = own.reshape(-1, 6)
+                moving.append(front.own)
             stack.extend(self._tree.nodes[node].children)
-        vertices = np.array(sorted(moves), dtype=np.int64)
-        tangents = np.array([moves[v] for v in vertices.tolist()]).reshape(-1, 6)
-        return Step(vertices, tangents, tuple(rigid))
+        vertices = np.sort(np.concatenate(moving)) if moving else np.zeros(0, dtype=np.int64)
+        return Step(vertices, moves[vertices], tuple(rigid))
 
     def _below(self, node: int) -> Numbers:
         """All vertices of a node and of those below it."""
@@ -204,7 +207,7 @@ class Fronts:
         _add_edges(matrix, place, blocks)
         for front in below:
             rows = _rows([place[v] for v in front.above.tolist()])
-            matrix[np.ix_(rows, rows)] += front.condensed
+            matrix[np.ix_(rows, rows)] += packed.symmetric(front.condensed, len(rows))
         split = 6 * len(own)
         diagonal = matrix.ravel()[:: 6 * size + 1][:split]
         diagonal += DAMPING
@@ -215,8 +218,6 @@ class Fronts:
 
 def _rigid_motion(tangents: Array, poses: Array) -> Array | None:
     """The motion (4, 4) in the world that vertices (k, 4, 4) share; None if they bend."""
-    if not len(poses):
-        return np.eye(4)
     centre = np.eye(4)
     centre[:3, 3] = poses[:, :3, 3].mean(axis=0)
     to_vertex = stacked.adjoint(stacked.inverse(poses) @ centre)
@@ -231,22 +232,29 @@ def _is_like(front: Front, before: Front) -> bool:
     """Whether a node says about the vertices above nearly what it said before."""
     if not np.array_equal(front.above, before.above):
         return False
-    scale = np.sqrt(np.maximum(np.diagonal(before.condensed), DAMPING))
+    size = 6 * len(front.above)
+    scale = np.sqrt(np.maximum(packed.diagonal(before.condensed, size), DAMPING))
     change = np.abs(front.condensed - before.condensed)
-    return bool((change <= LIKENESS * np.outer(scale, scale)).all())
+    return bool((change <= LIKENESS * packed.lower(np.outer(scale, scale))).all())
 
 
 def _front(own: Numbers, above: Numbers, matrix: Array, split: int) -> Front:
-    if not split:
-        return Front(own, above, np.zeros((0, 0)), np.zeros((0, len(matrix))), matrix)
-    factor, info = _potrf(matrix[:split, :split], lower=1, clean=1)
-    if info:
-        raise np.linalg.LinAlgError(f"vertex {own[max(info - 1, 0) // 6]} is not held by its edges")
-    if not len(above):
-        return Front(own, above, factor, np.zeros((split, 0)), np.zeros((0, 0)))
-    coupling = _trsm(1.0, factor, matrix[:split, split:], lower=1)
+    factor, coupling = np.zeros((0, 0)), np.zeros((split, 6 * len(above)))
+    if split:
+        factor, info = _potrf(matrix[:split, :split], lower=1, clean=1)
+        if info:
+            vertex = own[max(info - 1, 0) // 6]
+            raise np.linalg.LinAlgError(f"vertex {vertex} is not held by its edges")
+        if len(above):
+            coupling = _trsm(1.0, factor, matrix[:split, split:], lower=1)
     condensed = matrix[split:, split:] - coupling.T @ coupling
-    return Front(own, above, factor, coupling, condensed)
+    return Front(
+        own,
+        above,
+        factor=packed.lower(factor).astype(np.float32),
+        coupling=coupling.astype(np.float32),
+        condensed=packed.lower(condensed),
+    )
 
 
 def _add_edges(matrix: Array, place: Mapping[int, int], blocks: Blocks) -> None:
@@ -258,11 +266,6 @@ def _add_edges(matrix: Array, place: Mapping[int, int], blocks: Blocks) -> None:
     np.add.at(cells, (target, target), blocks.target_target)
     np.add.at(cells, (source, target), blocks.source_target)
     np.add.at(cells, (target, source), blocks.source_target.swapaxes(1, 2))
-
-
-def _places(front: Front, vertices: Numbers) -> Numbers:
-    place = {v: i for i, v in enumerate((*front.own.tolist(), *front.above.tolist()))}
-    return np.array([place[v] for v in vertices.tolist()], dtype=np.int64)
 
 
 def _rows(places: list[int]) -> Numbers:

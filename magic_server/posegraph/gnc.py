@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magic_server.posegraph.arrays import EdgeArrays
-from magic_server.posegraph.hierarchy import Hierarchy
 from magic_server.posegraph.optimiser import (
     FactorCache,
     anchored,
@@ -77,16 +76,7 @@ class GncResult:
 class RobustGraph:
     """A component with trusted edges and doubtful loops, solved again and again."""
 
-    def __init__(
-        self,
-        odometry: EdgeArrays,
-        loops: EdgeArrays,
-        anchors: dict[int, Array],
-        *,
-        hierarchical: bool = False,
-    ) -> None:
-        """`hierarchical` condenses regions for the last steps to the optimum."""
-        self._hierarchical = hierarchical
+    def __init__(self, odometry: EdgeArrays, loops: EdgeArrays, anchors: dict[int, Array]) -> None:
         self.odometry = odometry
         self.loops = loops
         self.anchors = anchors
@@ -110,14 +100,6 @@ class RobustGraph:
 
     def optimum(self, poses: Array, kept: NDArray[np.bool_]) -> Array:
         """Poses (n, 4, 4) at the optimum with the loops that are kept, from near it."""
-        if self._hierarchical:
-            edges = EdgeArrays.joined([self.odometry, self.loops.select(kept)])
-            found = poses.copy()
-            for vertex, pose in self.anchors.items():
-                found[vertex] = pose
-            Hierarchy(found, edges, self.anchors).settle(found, limit=np.inf, exactly=True)
-            if edges.squared_norms(found).sum() <= edges.squared_norms(poses).sum():
-                return found
         return self.solve(
             poses, kept.astype(float), max_iterations=FINAL_ITERATIONS, tolerance=FINELY
         )

@@ -57,6 +57,21 @@ class EdgeRows:
     def __len__(self) -> int:
         return len(self._source)
 
+    @property
+    def source(self) -> NDArray[np.int64]:
+        """(m,); valid until the next one is added."""
+        return self._source.view
+
+    @property
+    def target(self) -> NDArray[np.int64]:
+        """(m,); valid until the next one is added."""
+        return self._target.view
+
+    @property
+    def every(self) -> EdgeArrays:
+        """A copy of all of them."""
+        return self.some(np.arange(len(self)))
+
     def add(self, edges: EdgeArrays) -> int:
         """More edges; the number of the last one."""
         self._source.extend(edges.source)

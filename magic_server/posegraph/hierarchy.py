@@ -1,4 +1,4 @@
-"""A pose graph of any size, kept at its optimum as it grows: what is new costs its neighbourhood.
+"""A pose graph of any size, kept near its optimum as it grows: what is new costs its neighbourhood.
 
 Regions of the graph are condensed onto the separators between them, these onto the separators above
 them, and so on (`Dissection`, `Fronts`). A new sub-map or loop has only its own region eliminated
@@ -6,14 +6,16 @@ again, and the separators above that one. From the top down, poses are then put 
 separators that moved.
 
 Matrices may be older than the poses: they decide how fast the optimum is reached, not where it is.
-That is the gradient's part (`Tension`), which is always that of the present poses: what is left
-undone for its smallness adds up there until it is worth a step.
+That is the gradient's part (`Tension`), which is always that of the present poses. A settlement is
+a few steps, each of which makes the graph's error smaller or is taken back; what is left undone is
+small, and adds up in the gradient.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from magic_server.posegraph import stacked
 from magic_server.posegraph.arrays import EdgeArrays
 from magic_server.posegraph.dissection import Dissection
 from magic_server.posegraph.fronts import REACH, Blocks, Fronts, Step
+from magic_server.posegraph.growing import Rows
 from magic_server.posegraph.tension import Tension
 
 Array = NDArray[np.float64]
@@ -32,15 +35,16 @@ REGION = 48
 SMALL_M = 0.01
 """A step that moves something by more is followed by another: it was not quite linear."""
 LOCAL_ROUNDS = 3
-GOOD_STEP = 0.3
-"""A step larger than this share of the one before says that matrices are too old."""
-EXACT_SHARE = 0.02
-"""After growing by this share, all that small steps left undone is taken in."""
-ARRIVED_M = 1e-4
-"""Exact steps go on while one moves something by more (or turns it by a third of it)."""
+SHARES = (1.0, 0.5, 0.25)
+"""Of a step that goes too far, a part is tried: the matrices say less than the edges hold."""
 STALE = 0.05
 """Edges whose residual changed by more (m, rad) since their matrices were made get new ones."""
-ROUNDS = 8
+RENEWED = 8
+"""So many nodes with such edges are eliminated again per settlement."""
+LEFT_STALE = 32
+"""So many nodes wait for the next settlement to be eliminated again."""
+COST_NOISE = 1e-6
+"""Errors that differ by less are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +55,16 @@ class Settled:
     """Vertices whose poses changed, ascending."""
     strained: Numbers
     """Edges that were looked at again and whose squared norm reaches the limit, ascending."""
-    exact: bool
-    """Whether all that smaller steps had left undone was taken in."""
 
 
 class Hierarchy:
     """Owns the condensed regions of a graph; the poses belong to the caller."""
 
     def __init__(self, poses: Array, edges: EdgeArrays, held: Collection[int]) -> None:
-        """All edges count; vertices in `held` stay at their poses, of (n, 4, 4)."""
+        """All edges count; vertices in `held` stay at their poses, of (n, 4, 4).
+
+        Nothing is condensed yet: that is the long part, see `condense`.
+        """
         self._held = set(held)
         self._tension = Tension()
         self._tension.add_vertices(len(poses))
@@ -70,15 +75,24 @@ class Hierarchy:
         self._inside: list[set[int]] = [set() for _ in self._tree.nodes]
         self._home = [-1] * len(edges)
         self._stale = set(range(len(self._tree.nodes)))
-        """Nodes to eliminate again."""
-        self._unanswered = len(edges)
-        """Edges added or removed since the gradient was last taken in as a whole."""
-        self._changed = set(range(len(edges)))
-        """Edges whose poses changed since they were refreshed."""
-        for number in range(len(edges)):
-            for vertex in edges.ends(number):
+        """Nodes to eliminate again before a step."""
+        self._aged = set[int]()
+        """Nodes whose matrices are old; steps may do with them."""
+        self._changed = Rows((), np.bool_)
+        """Which edges are to be refreshed: their poses changed."""
+        self._changed.extend(np.ones(len(edges), dtype=bool))
+        self._counts = Rows((), np.bool_)
+        self._counts.extend(np.ones(len(edges), dtype=bool))
+        for number, ends in enumerate(
+            zip(edges.source.tolist(), edges.target.tolist(), strict=True)
+        ):
+            for vertex in ends:
                 self._at[vertex].append(number)
             self._house(number)
+
+    def __len__(self) -> int:
+        """How many vertices there are."""
+        return len(self._at)
 
     @property
     def regions(self) -> int:
@@ -89,6 +103,11 @@ class Hierarchy:
     def nbytes(self) -> int:
         """Memory of the condensed matrices."""
         return self._fronts.nbytes
+
+    @property
+    def cost(self) -> float:
+        """Half the squared Mahalanobis norms of all edges, at the poses of the last settlement."""
+        return self._tension.cost
 
     def add_vertex(self, near: int | None, pose: Array, *, held: bool = False) -> None:
         """The next vertex, into the region of the vertex `near` or of its pose (4, 4)."""
@@ -110,8 +129,8 @@ class Hierarchy:
         self._at[target].append(number)
         for one in self._at[max(source, target)] if lessened else (number,):
             self._house(one)
-        self._changed.add(number)
-        self._unanswered += 1
+        self._changed.append(True)
+        self._counts.append(True)
         return number
 
     def remove_edge(self, number: int) -> None:
@@ -121,95 +140,106 @@ class Hierarchy:
         self._inside[self._home[number]].discard(number)
         self._stale.add(self._home[number])
         self._home[number] = -1
-        self._changed.discard(number)
-        self._unanswered += 1
+        self._counts.view[number] = False
         self._tension.release(number)
 
-    def moved(self, vertices: Iterable[int]) -> None:
+    def moved(self, vertices: Numbers) -> None:
         """The caller moved some vertices."""
-        for vertex in vertices:
-            self._changed.update(self._at[vertex])
+        edges, moving = self._tension.edges, np.zeros(len(self), dtype=bool)
+        moving[vertices] = True
+        self._changed.view[moving[edges.source] | moving[edges.target]] = True
 
-    def settle(self, poses: Array, *, limit: float, exactly: bool = False) -> Settled:
-        """Move poses (n, 4, 4), in place, to where the edges want them.
+    def condense(self, poses: Array, *, at_most: int) -> bool:
+        """Eliminate so many of the nodes that have to be; whether none is left."""
+        self._split_large(poses)
+        nodes = self._tree.nodes
+        deepest = sorted(self._stale, key=lambda node: -nodes[node].depth)[:at_most]
+        self._stale.difference_update(deepest)
+        self._eliminate(deepest, poses, upwards=False)  # those above are to be, too
+        return not self._stale
 
-        `exactly` goes on to the last digit, at the cost of the whole graph; so does a settlement
-        once the graph has grown by `EXACT_SHARE`.
-        """
-        moved: set[int] = set()
-        strained = self._refresh(poses, limit, fresh=True)
-        if not exactly and self._unanswered < EXACT_SHARE * len(self._at):
-            self._eliminate(poses, exactly=False)
-            last = np.inf
-            for _ in range(LOCAL_ROUNDS):
-                step = self._fronts.step(self._tension.fresh, poses, self._held)
-                moved.update(self._take(step, poses))
-                strained.update(self._refresh(poses, limit, fresh=True))
-                size = _size_m(step)
-                exactly = size > max(SMALL_M, GOOD_STEP * last)
-                if size < SMALL_M or exactly:
-                    break
-                last = size
-            self._tension.forget_fresh()
-        else:
-            exactly = True
-        if exactly:
-            moved.update(self._settle_exactly(poses))
-            self._changed.update(n for n, home in enumerate(self._home) if home >= 0)
-            strained = self._refresh(poses, limit, fresh=False)
-        over = [n for n, is_over in strained.items() if is_over and self._home[n] >= 0]
-        return Settled(np.array(sorted(moved), np.int64), np.array(sorted(over), np.int64), exactly)
+    def keep_up(self, poses: Array) -> None:
+        """Eliminate what has to be, once there is so much of it that the next step would wait."""
+        if len(self._stale) > LEFT_STALE:
+            self._split_large(poses)
+            stale, self._stale = self._stale, set()
+            self._eliminate(stale, poses)
 
-    def _settle_exactly(self, poses: Array) -> set[int]:
-        """Steps against all that is left of the gradient, until they are small."""
-        moved: set[int] = set()
-        self._unanswered = 0
+    def taken_over(self, poses: Array, *, limit: float) -> Numbers:
+        """Poses (n, 4, 4) are those of a solve of everything; the edges beyond the limit."""
+        self._changed.view[:] = True
+        strained = self._refresh(poses, limit)
         self._tension.forget_fresh()
-        last = np.inf
-        for _ in range(ROUNDS):
-            self._changed.update(n for n, home in enumerate(self._home) if home >= 0)
-            self._refresh(poses, np.inf, fresh=False)
-            self._eliminate(poses, exactly=True)
-            gradient = dict(enumerate(self._tension.gradient))
-            step = self._fronts.step(gradient, poses, self._held)
-            moved.update(self._take(step, poses))
-            size = _size_m(step)
-            if size < ARRIVED_M:
-                break
-            if size > GOOD_STEP * last:
-                self._stale.update(range(len(self._tree.nodes)))
-            last = size
-        return moved
+        return _over(strained)
 
-    def _refresh(self, poses: Array, limit: float, *, fresh: bool) -> dict[int, bool]:
+    def settle(self, poses: Array, *, limit: float, wholly: bool = False) -> Settled:
+        """Move poses (n, 4, 4), in place, towards where the edges want them.
+
+        Steps answer what changed since the last settlement; `wholly`, also what that left undone.
+        """
+        moved: list[Numbers] = []
+        strained = self._refresh(poses, limit)
+        self._split_large(poses)
+        stale, self._stale = self._stale, set()
+        stale.update(islice(sorted(self._aged - stale), RENEWED))
+        self._eliminate(stale, poses)
+        for _ in range(LOCAL_ROUNDS):
+            step = self._step(poses, wholly=wholly)
+            if not self._goes_down(step, poses, limit, strained):
+                break
+            moved.append(step.moving)
+            if _size_m(step) < SMALL_M:
+                break
+        self._tension.forget_fresh()
+        every = np.unique(np.concatenate(moved)) if moved else np.zeros(0, dtype=np.int64)
+        return Settled(every, _over({n: o for n, o in strained.items() if self._home[n] >= 0}))
+
+    def _goes_down(self, step: Step, poses: Array, limit: float, strained: dict[int, bool]) -> bool:
+        """Take a step, or a part of it that lowers the cost; False where none does."""
+        before, cost = poses[step.moving], self.cost
+        for share in SHARES:
+            self._take(step.scaled(share), poses)
+            strained |= self._refresh(poses, limit)
+            if self.cost <= cost + COST_NOISE:
+                return True
+            poses[step.moving] = before
+        self.moved(step.moving)
+        strained |= self._refresh(poses, limit)
+        return False
+
+    def _step(self, poses: Array, *, wholly: bool) -> Step:
+        vertices, gradient = self._tension.fresh
+        if wholly:
+            vertices, gradient = np.arange(len(self)), self._tension.gradient
+        return self._fronts.step(vertices, gradient, poses, self._held)
+
+    def _refresh(self, poses: Array, limit: float) -> dict[int, bool]:
         """Edges whose poses changed pull anew; which of them now reach the limit."""
-        numbers = np.array(sorted(self._changed), dtype=np.int64)
-        self._changed.clear()
-        squared, change = self._tension.refresh(numbers, poses, fresh=fresh)
-        self._stale.update(self._home[n] for n in numbers[change > STALE].tolist())
+        numbers = np.flatnonzero(self._changed.view & self._counts.view)
+        self._changed.view[:] = False
+        squared, change = self._tension.refresh(numbers, poses)
+        self._aged.update(self._home[n] for n in numbers[change > STALE].tolist())
         return dict(zip(numbers.tolist(), (squared >= limit).tolist(), strict=True))
 
-    def _take(self, step: Step, poses: Array) -> set[int]:
+    def _take(self, step: Step, poses: Array) -> None:
         """Move the poses; edges within what moves rigidly are none the wiser."""
         poses[step.vertices] = poses[step.vertices] @ stacked.exp(step.tangents)
-        self.moved(step.vertices.tolist())
-        moved = set(step.vertices.tolist())
+        self.moved(step.vertices)
         for vertices, motion in step.rigid:
             poses[vertices] = motion @ poses[vertices]
-            moved.update(vertices.tolist())
-        return moved
 
-    def _eliminate(self, poses: Array, *, exactly: bool) -> None:
+    def _split_large(self, poses: Array) -> None:
         for node in tuple(self._stale):
             if self._tree.split(node, poses[:, :3, 3], self._neighbours):
                 self._divided(node)
-        stale, self._stale = self._stale, set()
 
+    def _eliminate(self, stale: Collection[int], poses: Array, *, upwards: bool = True) -> None:
         def blocks(node: int) -> Blocks:
             numbers = np.array(sorted(self._inside[node]), dtype=np.int64)
             return self._tension.blocks(numbers, poses)
 
-        self._fronts.eliminate(stale, blocks, self._held, exactly=exactly)
+        done = self._fronts.eliminate(stale, blocks, self._held, upwards=upwards)
+        self._aged -= done
 
     def _divided(self, region: int) -> None:
         """A region became a separator and new regions below it: edges move down."""
@@ -237,3 +267,7 @@ class Hierarchy:
 
 def _size_m(step: Step) -> float:
     return float((np.abs(step.tangents) * REACH).max(initial=0.0))
+
+
+def _over(strained: dict[int, bool]) -> Numbers:
+    return np.array(sorted(n for n, is_over in strained.items() if is_over), dtype=np.int64)

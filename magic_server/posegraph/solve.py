@@ -98,8 +98,7 @@ def solve_part(part: Part, config: PoseGraphConfig) -> GncResult:
         start = place(part.chains, part.loops, known)
         return GncResult(start, np.zeros(0, dtype=bool), start)
     anchors = part.priors or {0: np.eye(4)}
-    regional = config.is_hierarchical(len(part.chains.chain))
-    graph = RobustGraph(part.odometry, part.loops, anchors, hierarchical=regional)
+    graph = RobustGraph(part.odometry, part.loops, anchors)
     if config.robust == "gnc":
         return RobustSolver(graph, part.chains, part.priors, config).solve(part.initial)
     weights = np.ones(len(part.loops))

@@ -16,7 +16,6 @@ def solve_files(
     paths: Sequence[Path],
     *,
     robust: Literal["none", "gnc"] = "gnc",
-    hierarchy: Literal["auto", "on", "off"] = "auto",
     output: Path | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, Any]:
@@ -30,7 +29,6 @@ def solve_files(
     problem = problem_of(graph)
     config = PoseGraphConfig(
         robust=robust,
-        hierarchy=hierarchy,
         odometry_floor_m=0.0,
         odometry_floor_rad=0.0,
         odometry_floor_share=0.0,

@@ -20,6 +20,15 @@ def inverse(transforms: Array) -> Array:
     return result
 
 
+def straightened(transforms: Array) -> Array:
+    """Transforms (n, 4, 4) whose rotations were nearly rotations; rounding adds up in products."""
+    result = transforms.copy()
+    rotation = transforms[..., :3, :3]
+    skewed = rotation.swapaxes(-1, -2) @ rotation
+    result[..., :3, :3] = rotation @ (1.5 * np.eye(3) - 0.5 * skewed)
+    return result
+
+
 def log(transforms: Array) -> Array:
     """Tangent vectors (n, 6), (translation, rotation), of (n, 4, 4) transforms."""
     phi = rotation_log(transforms[..., :3, :3])
