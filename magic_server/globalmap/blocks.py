@@ -1,9 +1,9 @@
 """Space cut into blocks, each refined by itself, so that a map may be larger than memory.
 
 A k-d tree over what the keyframes look at cuts space into boxes until a box's keyframes are few
-enough. Each Gaussian belongs to the one box that holds its mean. A box is refined with the
-keyframes that look into it and with all Gaussians that these show, as agents sent them; only its
-own are kept (the scheme of VastGaussian, Lin et al., CVPR 2024). No box waits for another.
+enough. Each Gaussian belongs to the one box that holds its mean. A box is refined with the part of
+each keyframe that looks into it, and with all Gaussians that these parts show, as agents sent them;
+only its own are kept (the scheme of VastGaussian, Lin et al., CVPR 2024). No box waits for another.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magic_core.geometry import se3
-from magic_server.globalmap.placement import PlacedSource
+from magic_core.geometry import Camera, se3
+from magic_server.globalmap.placement import PlacedSource, Window
 
 Point = NDArray[np.float64]
 
-_SAMPLE_STEP = 24  # pixels between the samples that say what a keyframe looks at
-_GUEST_SHARE = 0.2  # of a keyframe's samples inside a box, for it to teach the box too
+_SAMPLES_ACROSS = 16  # an image: points that say what a keyframe looks at
+_GUEST_SHARE = 0.02  # of a keyframe's samples inside a box, for it to teach the box too
+_WHOLE = 0.8  # of an image: parts larger than this are taken as all of it
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
 
@@ -37,20 +38,31 @@ class ViewPlace:
     keyframe: int
     seen: Point
     """(k, 3) world points on the surface it sees, metres; its own place where it has no depth."""
+    pixels: NDArray[np.int64]
+    """(k, 2) where it sees them: column and row."""
+    size: tuple[int, int]
+    """Width and height of its images."""
 
     @property
     def centre(self) -> Point:
         """(3,) the middle of what it sees."""
         return np.median(self.seen, axis=0)
 
+    @property
+    def step(self) -> int:
+        """Pixels between samples."""
+        return _sample_step(self.size[0])
+
 
 @dataclass(frozen=True, slots=True)
 class BlockView:
-    """A keyframe that teaches a block."""
+    """The part of a keyframe that teaches a block."""
 
     source: int
     """Index of its sub-map."""
     keyframe: int
+    window: Window | None = None
+    """Which part; None is all of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +78,7 @@ class Block:
 
     def holds(self, points: NDArray) -> NDArray[np.bool_]:
         """(n,) which points (n, 3) lie in the box."""
-        return np.asarray(((points >= self.low) & (points < self.high)).all(axis=1))
+        return _inside(points, self.low, self.high)
 
     def wants(self, points: NDArray) -> NDArray[np.bool_]:
         """(n,) which points (n, 3) lie in the box or in what its keyframes show."""
@@ -84,26 +96,42 @@ def places_of(sources: Sequence[PlacedSource]) -> list[ViewPlace]:
     """What every keyframe looks at; reads one depth image at a time."""
     places = []
     for index, source in enumerate(sources):
+        size = (source.camera.width, source.camera.height)
         for keyframe, pose in enumerate(source.keyframe_poses()):
             world_from_camera = source.world_from_anchor @ pose
-            _, depth = source.images(keyframe)
-            half = _SAMPLE_STEP // 2
-            points = source.camera.back_project(depth)[half::_SAMPLE_STEP, half::_SAMPLE_STEP]
-            points = points[points[..., 2] > 0].reshape(-1, 3)
-            if not len(points):
-                points = np.zeros((1, 3), np.float32)
-            places.append(
-                ViewPlace(index, keyframe, se3.transform_points(world_from_camera, points))
-            )
+            pixels, points = _samples(source.camera, source.images(keyframe)[1])
+            seen = se3.transform_points(world_from_camera, points)
+            places.append(ViewPlace(index, keyframe, seen, pixels, size))
     return places
 
 
+def _samples(camera: Camera, depth: NDArray) -> tuple[NDArray[np.int64], NDArray]:
+    """Pixels (k, 2) spread over an image and the points (k, 3) seen there, in the camera frame.
+    Where depth is unknown it is that of the nearest sample with depth."""
+    from scipy.spatial import KDTree
+
+    step = _sample_step(camera.width)
+    rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    measured = depth[pixels[:, 1], pixels[:, 0]]
+    known = measured > 0
+    if not known.any():
+        return pixels, np.zeros((len(pixels), 3), np.float32)
+    _, nearest = KDTree(pixels[known]).query(pixels)
+    metres = np.where(known, measured, measured[known][nearest])
+    return pixels, camera.rays()[pixels[:, 1], pixels[:, 0]] * metres[:, None]
+
+
+def _sample_step(width: int) -> int:
+    return max(width // _SAMPLES_ACROSS, 1)
+
+
 def plan_blocks(places: Sequence[ViewPlace], *, most_views: int) -> list[Block]:
-    """Boxes that fill space without overlap, each with at most `most_views` keyframes of its own
-    and half as many guests whose own box is another."""
+    """Boxes that fill space without overlap, each with at most `most_views` keyframes of its own,
+    and parts of others that are as many images together."""
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
     boxes = _split(list(places), *everywhere, most_views=most_views)
-    return [_with_guests(own, low, high, places, most=most_views // 2) for own, low, high in boxes]
+    return [_with_guests(own, low, high, places, most=most_views) for own, low, high in boxes]
 
 
 def _split(
@@ -130,16 +158,22 @@ def _with_guests(
     own: list[ViewPlace], low: Point, high: Point, places: Sequence[ViewPlace], *, most: int
 ) -> Block:
     mine = {(place.source, place.keyframe) for place in own}
-    shares = [
-        (float(((place.seen >= low) & (place.seen < high)).all(axis=1).mean()), number)
-        for number, place in enumerate(places)
-        if (place.source, place.keyframe) not in mine
-    ]
-    best = sorted((pair for pair in shares if pair[0] >= _GUEST_SHARE), reverse=True)[:most]
-    chosen = [*own, *(places[number] for _, number in best)]
-    views = [BlockView(place.source, place.keyframe) for place in chosen]
-    seen = np.concatenate([place.seen for place in chosen])
-    reach = np.percentile(seen, (_REACH_PERCENTILE, 100 - _REACH_PERCENTILE), axis=0)
+    inside = [_inside(place.seen, low, high) for place in places]
+    ranked = sorted(range(len(places)), key=lambda number: -inside[number].mean())
+    views, seen, room = [], [], float(most)
+    for number in ranked:
+        place, share = places[number], float(inside[number].mean())
+        is_mine = (place.source, place.keyframe) in mine
+        if not is_mine and (share < _GUEST_SHARE or room <= 0.0):
+            continue
+        window = _window(place, inside[number])
+        shown = _within(place, window)
+        room -= 0.0 if is_mine else float(shown.mean())
+        views.append(BlockView(place.source, place.keyframe, window))
+        seen.append(place.seen[shown])
+    reach = np.percentile(
+        np.concatenate(seen), (_REACH_PERCENTILE, 100 - _REACH_PERCENTILE), axis=0
+    )
     return Block(
         low,
         high,
@@ -147,6 +181,29 @@ def _with_guests(
         reach[0] - _MARGIN_M,
         reach[1] + _MARGIN_M,
     )
+
+
+def _window(place: ViewPlace, inside: NDArray[np.bool_]) -> Window | None:
+    """The part of an image that shows a box, a sample's distance wider on all sides."""
+    if not inside.any():
+        return None
+    (width, height), chosen = place.size, place.pixels[inside]
+    left, top = np.maximum(chosen.min(axis=0) - place.step, 0).tolist()
+    right, bottom = np.minimum(chosen.max(axis=0) + place.step + 1, place.size).tolist()
+    whole = (right - left) * (bottom - top) >= _WHOLE * width * height
+    return None if whole else (left, top, right, bottom)
+
+
+def _within(place: ViewPlace, window: Window | None) -> NDArray[np.bool_]:
+    """(k,) which samples of a keyframe lie in a window of it."""
+    if window is None:
+        return np.ones(len(place.seen), dtype=bool)
+    return _inside(place.pixels, np.array(window[:2]), np.array(window[2:]))
+
+
+def _inside(points: NDArray, low: NDArray, high: NDArray) -> NDArray[np.bool_]:
+    """(n,) which points (n, d) are at least `low` and less than `high` along every axis."""
+    return np.asarray(((points >= low) & (points < high)).all(axis=1))
 
 
 def blocks_near(blocks: Sequence[Block], number: int) -> list[int]:

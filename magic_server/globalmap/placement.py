@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,6 +16,8 @@ from magic_core.geometry import Camera
 from magic_core.submap import Submap
 
 Pose = NDArray[np.float64]
+Window = tuple[int, int, int, int]
+"""Part of an image in pixels: left, top, right and bottom, these two exclusive."""
 
 
 class PlacedSource(Protocol):
@@ -74,6 +77,22 @@ class View:
     world_from_camera: Pose  # (4, 4)
     colour: NDArray[np.uint8]  # (h, w, 3) RGB
     depth: NDArray[np.float32]  # (h, w) metres, 0 = no reading
+    share: float = 1.0  # of the keyframe's image that this is
+
+    def part(self, window: Window) -> View:
+        """A part of it, as a camera with that part for its image sees it."""
+        left, top, right, bottom = window
+        camera = self.camera
+        seen = dataclasses.replace(
+            camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top
+        )
+        return View(
+            seen,
+            self.world_from_camera,
+            np.ascontiguousarray(self.colour[top:bottom, left:right]),
+            np.ascontiguousarray(self.depth[top:bottom, left:right]),
+            self.share * seen.width * seen.height / (camera.width * camera.height),
+        )
 
 
 def placed_gaussians(source: PlacedSource) -> GaussianCloud:

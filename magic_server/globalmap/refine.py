@@ -179,8 +179,10 @@ class FineStage:
 
 
 def budget_of(views: Sequence[View], config: MergeConfig) -> int:
-    """Most optimisation steps on these keyframes."""
-    return min(config.iterations, config.passes * max(len(views), _MIN_STEPS_PER_PASS))
+    """Most optimisation steps on these keyframes; steps on parts of them count as parts."""
+    share = float(np.mean([view.share for view in views])) if views else 1.0
+    most = config.passes * max(len(views), _MIN_STEPS_PER_PASS)
+    return min(round(config.iterations / share), most)
 
 
 def rates(config: MergeConfig, progress: float) -> LearningRates:

@@ -191,7 +191,11 @@ def _coarse_of(block: Block, sources: Sequence[PlacedSource]) -> tuple[GaussianC
 
 
 def _views_of(block: Block, sources: Sequence[PlacedSource]) -> list[View]:
-    return [view_of(sources[view.source], view.keyframe) for view in block.views]
+    views = []
+    for chosen in block.views:
+        view = view_of(sources[chosen.source], chosen.keyframe)
+        views.append(view if chosen.window is None else view.part(chosen.window))
+    return views
 
 
 def _wanted(block: Block, cloud: GaussianCloud) -> NDArray[np.intp]:

@@ -244,7 +244,7 @@ def _named(block: Block, sources: list[StoredSource], config: MergeConfig, what:
     """A name that no job with another outcome has."""
     from magic_server.globalmap.parts import fingerprint_of
 
-    digest = hashlib.sha256(repr([(v.source, v.keyframe) for v in block.views]).encode())
+    digest = hashlib.sha256(repr(block.views).encode())
     for corner in (block.low, block.high, block.reach_low, block.reach_high):
         digest.update(corner.astype("<f8").tobytes())
     return f"{fingerprint_of(sources, config)} {digest.hexdigest()} {what}"

@@ -9,6 +9,7 @@ import pytest
 
 from magic_core.gaussians import GaussianCloud
 from magic_core.geometry import se3
+from magic_core.render import Rasteriser
 from magic_server.globalmap import PlacedSubmap
 from magic_server.globalmap.blocks import ViewPlace, places_of, plan_blocks
 from magic_server.globalmap.exposure import ExposureModel
@@ -24,7 +25,11 @@ def silent(share: float, text: str) -> None:
 
 def row_of_places(count: int) -> list[ViewPlace]:
     rng = np.random.default_rng(1)
-    return [ViewPlace(i, 0, rng.normal((0.5 * i, 0.0, 0.0), 0.4, (40, 3))) for i in range(count)]
+    pixels = np.stack([np.arange(10, 320, 20), np.full(16, 120)], axis=1)
+    return [
+        ViewPlace(i, 0, rng.normal((0.5 * i, 0.0, 0.0), 0.4, (16, 3)), pixels, (320, 240))
+        for i in range(count)
+    ]
 
 
 def test_blocks_fill_space_without_overlap_and_hold_few_keyframes():
@@ -37,6 +42,89 @@ def test_blocks_fill_space_without_overlap_and_hold_few_keyframes():
     assert {place.source for block in blocks for place in block.views} == set(range(30))
     # Guests: a keyframe at the border teaches both sides.
     assert sum(len(block.views) for block in blocks) > 30
+
+
+def wall(count: int) -> list[ViewPlace]:
+    """Cameras along a wall, each with four metres of it across its image."""
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(10, 320, 20), [60, 180]))
+    pixels = np.stack([columns, rows], axis=1)
+    height = np.where(rows < 120, 1.0, -1.0)
+    places = []
+    for number in range(count):
+        seen = np.stack([0.5 * number + columns / 80.0, height, np.zeros(32)], axis=1)
+        places.append(ViewPlace(number, 0, seen, pixels, (320, 240)))
+    return places
+
+
+def test_a_block_takes_the_part_of_each_keyframe_that_looks_into_it():
+    places = wall(40)
+    blocks = plan_blocks(places, most_views=10)
+    assert len(blocks) == 4
+    for block in blocks:
+        views = {view.source: view for view in block.views}
+        for place in places:
+            inside = block.holds(place.seen)
+            view = views.get(place.source)
+            if view is None:
+                assert inside.mean() < 0.1
+            elif view.window is None:
+                assert inside.mean() > 0.7
+            else:
+                left, top, right, bottom = view.window
+                assert (place.pixels[inside] >= [left, top]).all()
+                assert (place.pixels[inside] < [right, bottom]).all()
+                assert (top, bottom) == (40, 201)
+                assert right - left <= np.ptp(place.pixels[inside, 0]) + 41
+    # Nothing is looked at by a keyframe and learnt by no block.
+    learnt = sum(int(b.holds(places[v.source].seen).sum()) for b in blocks for v in b.views)
+    assert learnt == sum(len(place.seen) for place in places)
+
+
+def test_keyframes_of_other_blocks_are_bounded_by_what_they_show():
+    places = wall(40)
+    for block in plan_blocks(places, most_views=4):
+        own = sum(block.holds(place.centre[None])[0] for place in places)
+        shares = [
+            1.0 if v.window is None else (v.window[2] - v.window[0]) / 320 * 161 / 240
+            for v in block.views
+        ]
+        assert own <= 4
+        assert sum(shares) <= own + 4 + 1
+
+
+def test_a_part_of_a_view_shows_a_part_of_the_picture():
+    placed = submap(0, 0.0, 0.0)
+    view = views_of([placed])[0]
+    part = view.part((20, 12, 61, 47))
+    cloud, rasteriser = coarse_merge([placed]), Rasteriser(1)
+    whole = rasteriser.render(cloud, view.camera, view.world_from_camera).colour.copy()
+    shown = rasteriser.render(cloud, part.camera, part.world_from_camera).colour
+    np.testing.assert_allclose(shown, whole[12:47, 20:61], atol=2e-3)
+    assert np.array_equal(part.colour, view.colour[12:47, 20:61])
+    assert part.share == 41 * 35 / (view.camera.width * view.camera.height)
+    smaller = part.part((1, 2, 11, 12))
+    assert smaller.share == pytest.approx(100 / (view.camera.width * view.camera.height))
+
+
+def test_where_depth_is_unknown_a_keyframe_looks_as_far_as_beside_it():
+    placed = submap(0, 0.0, 0.0)
+    keyframe = placed.submap.keyframes[0]
+    depth = keyframe.depth.copy()
+    depth[:, depth.shape[1] // 2 :] = 0.0
+    half = replace(
+        placed, submap=replace(placed.submap, keyframes=(replace(keyframe, depth=depth),))
+    )
+    known, unknown = places_of([placed])[0], places_of([half])[0]
+    assert len(unknown.seen) == len(known.seen)
+    left = known.pixels[:, 0] < depth.shape[1] // 2
+    np.testing.assert_allclose(unknown.seen[left], known.seen[left], atol=1e-6)
+    blind = replace(half, submap=replace(half.submap, keyframes=(
+        replace(keyframe, depth=np.zeros_like(depth)),
+    )))  # fmt: skip
+    (nowhere,) = places_of([blind])
+    centre = (placed.world_from_anchor @ keyframe.anchor_from_camera)[:3, 3]
+    np.testing.assert_allclose(nowhere.seen - centre, 0.0, atol=1e-9)
+    assert plan_blocks([nowhere], most_views=1)[0].views[0].window is None
 
 
 def test_a_map_that_fits_is_one_block():
@@ -127,7 +215,7 @@ def test_within_a_later_round_it_goes_on_from_the_last_checkpoint(tmp_path, monk
     monkeypatch.setattr("magic_server.globalmap.refine._CHECKPOINT_S", 0.0)
     monkeypatch.setattr("magic_server.globalmap.refine._MIN_STEPS_PER_PASS", 10)
     placed = [submap(0, -0.6, -0.3), submap(1, 0.6, 0.3)]
-    config = replace(CONFIG, block_views=2, iterations=100, passes=100, converged=0.0)
+    config = replace(CONFIG, block_views=2, iterations=1000, passes=10, converged=0.0)
 
     class Cut(Exception):
         """The server is killed."""
@@ -176,8 +264,6 @@ def test_keyframes_of_different_exposure_make_one_even_map():
 
     def best_psnr(cloud: GaussianCloud) -> float:
         """After one brightness for the whole picture, which no map can know."""
-        from magic_core.render import Rasteriser
-
         ours = Rasteriser(1).render(cloud, CAMERA, pose).colour.reshape(-1)
         real = (render(CAMERA, pose)[0] / 255.0).reshape(-1)
         fit = np.polyval(np.polyfit(ours, real, 1), ours)
