@@ -21,6 +21,7 @@ Point = NDArray[np.float64]
 
 _SAMPLES_ACROSS = 16  # an image: points that say what a keyframe looks at
 _GUEST_SHARE = 0.02  # of a keyframe's samples inside a box, for it to teach the box too
+_WIDER = 2  # samples by which a part is wider on all sides than what lies in the box
 _WHOLE = 0.8  # of an image: parts larger than this are taken as all of it
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
@@ -184,12 +185,12 @@ def _with_guests(
 
 
 def _window(place: ViewPlace, inside: NDArray[np.bool_]) -> Window | None:
-    """The part of an image that shows a box, a sample's distance wider on all sides."""
+    """The part of an image that shows a box, and some of what is beside it."""
     if not inside.any():
         return None
-    (width, height), chosen = place.size, place.pixels[inside]
-    left, top = np.maximum(chosen.min(axis=0) - place.step, 0).tolist()
-    right, bottom = np.minimum(chosen.max(axis=0) + place.step + 1, place.size).tolist()
+    (width, height), chosen, wider = place.size, place.pixels[inside], _WIDER * place.step
+    left, top = np.maximum(chosen.min(axis=0) - wider, 0).tolist()
+    right, bottom = np.minimum(chosen.max(axis=0) + wider + 1, place.size).tolist()
     whole = (right - left) * (bottom - top) >= _WHOLE * width * height
     return None if whole else (left, top, right, bottom)
 
