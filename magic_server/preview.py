@@ -124,8 +124,22 @@ class Previews:
         await self._forget_deleted(coordinator)
         last = self._last.get(row.id)
         if last is None or kind not in last.files:
-            last = await self._made(coordinator, kind)
+            # It is made to its end whoever leaves: a worker that has begun does not stop, and what
+            # it leaves would lie there unknown.
+            making = self._tasks.start(self._outcome(coordinator, kind), name="making")
+            found = await asyncio.shield(making)
+            if isinstance(found, Exception):
+                raise found
+            return found
         return last
+
+    async def _outcome(
+        self, coordinator: SessionCoordinator, kind: records.MapFormat
+    ) -> _Preview | Exception:
+        try:
+            return await self._made(coordinator, kind)
+        except Exception as error:  # whoever waits raises it
+            return error
 
     async def _follow(self) -> None:
         """Build anew whatever session's pose graph has changed, one after another."""
@@ -177,7 +191,11 @@ class Previews:
             delivery = self._deliveries.of(folder)
             placed = await self._placed(coordinator, chosen)
             task = PreviewTask(placed, tuple(sorted(kinds)), delivery)
-            outcome = await self._jobs.run(append_submaps, task)
+            try:
+                outcome = await self._jobs.run(append_submaps, task)
+            except Exception:
+                await self._in_thread(delivery.clear)
+                raise
             info = records.GlobalMapInfo(
                 name=names.map_name(session.name, PREVIEW_ID),
                 component=chosen[0].component,

@@ -147,3 +147,37 @@ async def test_without_following_it_is_made_when_asked_for(
         assert len(await client.get_global_map(PREVIEW)) == len(submap.gaussians)
         with pytest.raises(NotFound):
             await client.get_global_map("sessions/nowhere/maps/preview")
+
+
+async def test_a_preview_whose_asker_leaves_is_made_and_kept(
+    tmp_path, new_store: NewStore, jobs: JobConfig
+):
+    server_config = config_of(tmp_path, new_store(), jobs, enabled=False)
+    async with Server(server_config) as server, MagicClient(server.address) as client:
+        await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+        submap = make_submap(agent=0, index=0)
+        await client.submit_submap(submap)
+
+        async def is_placed() -> bool:
+            return bool((await client.get_corrected_poses("room")).poses)
+
+        await eventually(is_placed)
+        begun, go_on, run, count = asyncio.Event(), asyncio.Event(), server._jobs.run, 0
+
+        async def held_up(function, /, *arguments):
+            nonlocal count
+            count += 1
+            begun.set()
+            await go_on.wait()
+            return await run(function, *arguments)
+
+        server._jobs.run = held_up
+        asking = asyncio.create_task(client.get_global_map(PREVIEW))
+        await begun.wait()
+        asking.cancel()
+        await asyncio.gather(asking, return_exceptions=True)
+        go_on.set()
+        await eventually(_only_one(server_config))
+        assert len(await client.get_global_map(PREVIEW)) == len(submap.gaussians)
+        assert count == 1
+        assert await _only_one(server_config)()
