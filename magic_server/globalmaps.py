@@ -14,7 +14,7 @@ from pathlib import Path
 from magicslam.v1 import global_map_service_pb2 as map_pb
 from magicslam.v1 import mapping_service_pb2 as mapping_pb
 
-from magic_core.errors import InvalidInput, MagicError, NotFound, WrongState
+from magic_core.errors import HeldElsewhere, InvalidInput, MagicError, NotFound, WrongState
 from magic_core.wire import geometry, names, records
 from magic_server.blockwise import BlockwiseMerge, is_blockwise
 from magic_server.config import ServerConfig
@@ -55,6 +55,7 @@ class GlobalMaps:
         self._config = config
         self._tasks = TaskScope("global maps")
         self._under_way: dict[int, set[asyncio.Task[None]]] = {}
+        self._handed_on: set[asyncio.Task[None]] = set()
         self._changed = asyncio.Event()
         self._stopping = False
         self._closing = False
@@ -94,10 +95,17 @@ class GlobalMaps:
 
     async def forget(self, session: SessionRow) -> None:
         """Stop what is under way in a session that is being deleted."""
-        mine = self._under_way.pop(session.id, set())
-        for task in mine:
-            task.cancel()
-        await asyncio.gather(*mine, return_exceptions=True)
+        await _ended(set(self._under_way.pop(session.id, ())))
+
+    async def hand_on(self, session: int) -> None:
+        """Stop what is under way in a session, by row id, that another server may have: it goes on
+        there, with what the jobs left in a bucket."""
+        mine = set(self._under_way.pop(session, ()))
+        self._handed_on |= mine
+        try:
+            await _ended(mine)
+        finally:
+            self._handed_on -= mine
 
     async def build(self, request: map_pb.BuildGlobalMapRequest) -> records.OperationStatus:
         """The operation of a request, begun now unless it was before."""
@@ -145,6 +153,8 @@ class GlobalMaps:
         try:
             with translated_disk_errors():
                 await self._merge(operation, session, request)
+        except HeldElsewhere as error:
+            logger.warning("%s: its merge goes on there: %s", session.name, error)
         except MagicError as error:
             await self._store.maps.fail(operation, error, now=time.time())
         except Exception:
@@ -167,6 +177,7 @@ class GlobalMaps:
         folder = self._folder_of(operation)
         await self._in_thread(lambda: folder.mkdir(exist_ok=True))
         delivery = self._delivery(folder)
+        ours = True
         try:
             try:
                 task = await self._task(coordinator, chosen, request, delivery)
@@ -175,9 +186,13 @@ class GlobalMaps:
                 _require_all(coordinator, chosen, error)
                 raise
             await self._keep(operation, session, snapshot.revision, chosen, outcome)
+        except HeldElsewhere:
+            ours = False
+            raise
         finally:
             if not self._closing:  # a server that stops keeps what it has, to go on from there
-                await asyncio.shield(self._in_thread(delivery.clear))
+                if ours and asyncio.current_task() not in self._handed_on:
+                    await asyncio.shield(self._in_thread(delivery.clear))
                 await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
 
     def _delivery(self, folder: Path) -> Delivery:
@@ -287,6 +302,12 @@ class GlobalMaps:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+async def _ended(tasks: set[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _require_all(

@@ -171,8 +171,9 @@ class Leasing:
         async with self._locks[session]:
             self._leases.forget(session)
             self._until.pop(session, None)
+            # First: what it lacks without the rest of the session would be taken for a failure.
+            await self._maps.hand_on(session)
             moved = HeldElsewhere("the session has moved to another server; ask again")
             dropped = await self._sessions.dismiss(session, moved)
             if dropped is not None:
-                await self._maps.forget(dropped)
                 logger.warning("%s: its lease was lost", dropped.name)

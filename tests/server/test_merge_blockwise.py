@@ -29,6 +29,7 @@ from magic_server.store.bucket_client import client_of
 from tests.cluster import running_cluster
 from tests.server.test_globalmap_merge import submap
 from tests.small_world import DIMENSION, MODEL_ID, make_submap
+from tests.waiting import eventually
 
 CONFIG = MergeConfig(iterations=20, threads=1, block_views=3, converged=0.0)
 SUBMAPS = 4  # of two keyframes each
@@ -73,8 +74,8 @@ def done_blocks(config: ServerConfig) -> dict[str, object]:
         keys = [key for key, _ in listed(client, "jobs/") if key.endswith("/concluded.json")]
         return {key.split("/")[-2]: whole(client, key) for key in keys}
     found: dict[str, object] = {}
-    for file in config.data_dir.glob("**/merge-*/b*-*/block_*.json"):
-        with contextlib.suppress(FileNotFoundError):  # the merge may just have ended
+    with contextlib.suppress(FileNotFoundError):  # the merge may just have ended
+        for file in config.data_dir.glob("**/merge-*/b*-*/block_*.json"):
             found[file.parent.name] = file.stat().st_mtime_ns
     return found
 
@@ -223,6 +224,28 @@ async def test_on_a_cluster_a_lost_worker_costs_its_block_alone(tmp_path: Path) 
             cluster.kill("one")
             await watched(client, config, begun.name, before)
             assert names.count("refine_block") >= 3
+
+
+@pytest.mark.slow
+async def test_a_session_that_moves_leaves_its_blocks_in_the_bucket(
+    server: Server, client: MagicClient, server_config: ServerConfig
+) -> None:
+    if server_config.jobs.executor == "pool":
+        pytest.skip("no bucket to leave blocks in")
+    await submit(client)
+    run = server._jobs.run
+    jobs_of(server, blocks=1)
+    begun = await client.start_global_map("room", request_id="map")
+    before = await first_block(server_config)
+    session = await server._store.agents.session("room")
+    await server._maps.hand_on(session.id)
+    assert done_blocks(server_config) == before
+    assert not list(server_config.data_dir.glob("**/merge-*"))
+    assert not (await client.get_operation(begun.name)).done
+    server._jobs.run = run
+    await server._maps.resume(session)  # as the server does that takes it
+    await watched(client, server_config, begun.name, before)
+    await eventually(lambda: not done_blocks(server_config))
 
 
 @pytest.mark.slow
