@@ -30,9 +30,9 @@ HELD = 1e12
 """Information that holds a vertex."""
 LIKENESS = 0.002
 """Condensed matrices that differ by less, relative to their diagonals, do for a while."""
-STRAIN_M = 3e-4
+STRAIN_M = 1e-3
 """What lies below separators that bend by less moves as one rigid body."""
-STILL_M = 1e-5
+STILL_M = 1e-4
 """What lies below separators that move by less stays."""
 REACH = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0])
 """Metres that a rotation of one radian moves what is near."""

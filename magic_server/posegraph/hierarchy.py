@@ -34,7 +34,7 @@ REGION = 48
 """At most so many sub-maps are condensed at once."""
 SMALL_M = 0.01
 """A step that moves something by more is followed by another: it was not quite linear."""
-LOCAL_ROUNDS = 3
+LOCAL_ROUNDS = 2
 SHARES = (1.0, 0.5, 0.25)
 """Of a step that goes too far, a part is tried: the matrices say less than the edges hold."""
 STALE = 0.05

@@ -80,11 +80,26 @@ def adjoint(transforms: Array) -> Array:
 
 def rotation_log(rotations: Array) -> Array:
     """Rotation vectors (n, 3) of (n, 3, 3) rotations, exact near 0 and pi (by quaternions)."""
-    quaternions = quaternions_from_rotations(rotations)
+    quaternions = _small_quaternions(rotations)
     w, xyz = quaternions[..., :1], quaternions[..., 1:]
     norm = np.linalg.norm(xyz, axis=-1, keepdims=True)
     half = np.arctan2(norm, w)
     return xyz * np.where(norm < 1e-12, 2.0, 2.0 * half / np.maximum(norm, 1e-12))
+
+
+def _small_quaternions(rotations: Array) -> Array:
+    """The same as below, swiftly where all turn by less than 90 degrees."""
+    m = rotations
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    if not (trace > 1.0).all():
+        return quaternions_from_rotations(rotations)
+    w = 0.5 * np.sqrt(1.0 + trace)
+    quarter = 0.25 / w
+    x = quarter * (m[..., 2, 1] - m[..., 1, 2])
+    y = quarter * (m[..., 0, 2] - m[..., 2, 0])
+    z = quarter * (m[..., 1, 0] - m[..., 0, 1])
+    found = np.stack([w, x, y, z], axis=-1)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
 def rotation_angles(transforms: Array) -> Array:

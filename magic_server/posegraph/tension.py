@@ -13,6 +13,9 @@ from magic_server.posegraph.growing import EdgeRows, Rows
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
+MANY = 10
+"""To count up all vertices is faster than to go to every ninth."""
+
 
 class Tension:
     """The gradient of half the squared Mahalanobis norms, by vertex; tangents are ours."""
@@ -24,8 +27,8 @@ class Tension:
         self._squared = Rows(())
         self._linearised = Rows((6,))
         """Residuals that matrices were last made at."""
-        self._gradient, self._fresh = Rows((6,)), Rows((6,))
-        self._is_fresh = Rows((), np.bool_)
+        self._gradient, self._forgotten = Rows((6,)), Rows((6,))
+        """Now, and when it was last forgotten what is fresh of it."""
 
     def __len__(self) -> int:
         return len(self.edges)
@@ -33,8 +36,7 @@ class Tension:
     def add_vertices(self, count: int) -> None:
         """More vertices, which nothing pulls at."""
         self._gradient.extend(np.zeros((count, 6)))
-        self._fresh.extend(np.zeros((count, 6)))
-        self._is_fresh.extend(np.zeros(count, dtype=bool))
+        self._forgotten.extend(np.zeros((count, 6)))
 
     def add(self, edges: EdgeArrays) -> None:
         """More edges; they pull once they are refreshed."""
@@ -97,20 +99,27 @@ class Tension:
         Each edge is in it with both ends, so that it adds up to no force and no moment. A step that
         answers it leaves in it what the step missed, once edges are refreshed.
         """
-        return np.flatnonzero(self._is_fresh.view), self._fresh.view
+        fresh = self._gradient.view - self._forgotten.view
+        return np.flatnonzero(fresh.any(axis=1)), fresh
 
     def forget_fresh(self) -> None:
         """What is left of it is small, or a step answers the whole gradient."""
-        self._fresh.view[:] = 0.0
-        self._is_fresh.view[:] = False
+        self._forgotten.view[:] = self._gradient.view
 
     def _pulled(self, edges: EdgeArrays, numbers: Numbers, pull: Array) -> None:
         change = pull - self._pull.view[numbers]
         self._pull.view[numbers] = pull
         for end, vertices in enumerate((edges.source, edges.target)):
-            np.add.at(self._gradient.view, vertices, change[:, end])
-            np.add.at(self._fresh.view, vertices, change[:, end])
-            self._is_fresh.view[vertices] = True
+            _add_at(self._gradient.view, vertices, change[:, end])
+
+
+def _add_at(rows: Array, index: Numbers, added: Array) -> None:
+    """Add (k, 6) to rows (n, 6), several to some."""
+    if MANY * len(index) < len(rows):
+        np.add.at(rows, index, added)
+        return
+    for axis in range(rows.shape[1]):
+        rows[:, axis] += np.bincount(index, weights=added[:, axis], minlength=len(rows))
 
 
 def _misfit(edges: EdgeArrays, poses: Array) -> tuple[Array, Array]:
