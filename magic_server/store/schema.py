@@ -44,7 +44,7 @@ submaps = sa.Table(
     "submaps",
     metadata,
     sa.Column("id", INTEGER, primary_key=True),  # grows with the order of arrival
-    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
     sa.Column("agent_id", sa.ForeignKey("agents.id"), nullable=False),
     sa.Column("number", INTEGER, nullable=False),  # index within the agent
     sa.Column("request_id", sa.String(128), nullable=False),
@@ -67,6 +67,8 @@ submaps = sa.Table(
     sa.Column("prior", sa.LargeBinary),  # float64 (4, 4)
     sa.Column("searched", sa.Boolean, nullable=False),  # loop candidates were looked for
     sa.UniqueConstraint("agent_id", "number"),
+    # Pages in the order of arrival: with the session alone PostgreSQL may sort all of it for each.
+    sa.Index("ix_submaps_arrival", "session_id", "id"),
     sqlite_autoincrement=True,
 )
 
@@ -136,7 +138,7 @@ loops = sa.Table(
     "loops",
     metadata,
     sa.Column("id", INTEGER, primary_key=True),
-    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False, index=True),
+    sa.Column("session_id", sa.ForeignKey("sessions.id"), nullable=False),
     sa.Column("source", sa.String, nullable=False),  # resource names
     sa.Column("target", sa.String, nullable=False),
     sa.Column("similarity", sa.Float, nullable=False),
@@ -154,6 +156,7 @@ loops = sa.Table(
     sa.Column("source_keyframe", INTEGER, nullable=False, server_default="0"),
     sa.Column("target_keyframe", INTEGER, nullable=False, server_default="0"),
     sa.UniqueConstraint("session_id", "source", "target"),
+    sa.Index("ix_loops_arrival", "session_id", "id"),
 )
 
 snapshots = sa.Table(

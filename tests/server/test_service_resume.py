@@ -161,6 +161,7 @@ async def test_a_server_that_was_killed_goes_on_with_what_had_come(
         sending.cancel()
         await asyncio.gather(sending, return_exceptions=True)
     for file, data in left.items():
+        file.parent.mkdir(exist_ok=True)
         file.write_bytes(data)
     async with Server(server_config) as second, MagicClient(second.address) as client:
         position = await client.resume_upload(NAME, "first")

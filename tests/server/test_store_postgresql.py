@@ -408,6 +408,27 @@ async def test_a_folder_from_before_keyframes_had_descriptors_opens_and_takes_th
         np.testing.assert_array_equal(vector, keyframe.descriptor)
 
 
+async def test_a_folder_from_before_pages_gets_the_indexes_of_a_new_one(tmp_path: Path) -> None:
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
+    with ThreadPoolExecutor(1) as threads:
+        async with Store(tmp_path, threads) as store:
+            await registered(store)
+        with closing(sqlite3.connect(tmp_path / "magic.sqlite")) as database:
+            new = {*database.execute(query)}
+            for table in ("submaps", "loops"):
+                database.execute(f"DROP INDEX ix_{table}_arrival")
+                database.execute(f"CREATE INDEX ix_{table}_session_id ON {table} (session_id)")
+            database.execute("UPDATE alembic_version SET version_num = '0004'")
+            database.commit()
+        async with Store(tmp_path, threads) as store:
+            session = await store.agents.session("room")
+            assert await store.agents.active(session) == ["agent_0"]
+            async with store._database.write() as connection:
+                assert await connection.run_sync(differences) == []
+        with closing(sqlite3.connect(tmp_path / "magic.sqlite")) as database:
+            assert {*database.execute(query)} == new
+
+
 async def test_a_new_database_has_every_table_and_a_later_one_is_refused(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as threads:
         async with Store(tmp_path, threads) as store, store._database.write() as connection:

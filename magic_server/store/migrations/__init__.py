@@ -15,7 +15,7 @@ from magic_server.store import schema
 
 logger = logging.getLogger(__name__)
 
-HEAD = "0004"
+HEAD = "0005"
 """The revision of this build."""
 FIRST = "0001"
 """What databases from before the revisions are at."""
