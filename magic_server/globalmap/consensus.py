@@ -23,7 +23,9 @@ from magic_server.globalmap.blocks import Block
 
 _FEATHER_M = 0.3
 """How far from a block its word counts, falling from one at the border to nothing."""
-_LEAST = 1e-6  # of a scale, an opacity and its distance from one, as the optimiser's
+# Of a scale, an opacity and its distance from one, as the optimiser's; and of a change of opacity:
+# what was not drawn is as it was but for the way into logits and back.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,8 @@ def guests_of(
     """
     outside = np.maximum(np.maximum(block.low - before.means, before.means - block.high), 0.0)
     weights = 1.0 - np.linalg.norm(outside, axis=1) / _FEATHER_M
-    shown = (before.opacities != after.opacities) | (before.means != after.means).any(axis=1)
+    fading = np.abs(before.opacities - after.opacities)
+    shown = (fading > _LEAST) | (before.means != after.means).any(axis=1)
     chosen = shown & (weights > 0.0)
     return Guests(
         owner,

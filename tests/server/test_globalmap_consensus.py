@@ -61,6 +61,20 @@ def test_a_rotation_and_its_negative_quaternion_are_the_same_word():
     np.testing.assert_allclose(made.quaternions, own.quaternions, atol=1e-6)
 
 
+def test_a_way_into_logits_and_back_is_not_taken_for_being_shown():
+    before = cloud(1000)
+    before.means[:] = 0.0
+    logits = np.log(before.opacities / (1.0 - before.opacities))
+    opacities = (1.0 / (1.0 + np.exp(-logits))).astype(np.float32)
+    assert (opacities != before.opacities).any()
+    opacities[:3] += 1e-4
+    after = GaussianCloud(
+        before.means, before.quaternions, before.scales, opacities, before.colours
+    )
+    found = guests_of(block(-1.0, 1.0), before, after, owner=3, places=np.arange(1000))
+    assert found.places.tolist() == [0, 1, 2]
+
+
 def test_a_block_speaks_of_what_it_showed_and_the_less_the_farther():
     before = cloud(4)
     before.means[:, 0] = [0.0, 0.15, 0.15, 0.5]
