@@ -9,16 +9,18 @@ its files in the bucket; there it also leaves how far it was, for whoever begins
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import hashlib
 import json
 import logging
+import os
 import shutil
 import tarfile
 import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -152,19 +154,18 @@ class BucketDelivery:
     @contextmanager
     def working(self) -> Iterator[Path]:
         """The job's folder, for a block, with what an earlier try kept."""
-        self.scratch.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix="job-", dir=self.scratch) as folder:
+        with _own_folder(self.scratch) as folder:
             if self.lasting:
-                self._restore(Path(folder))
-            yield Path(folder)
+                self._restore(folder)
+            yield folder
 
     def keep(self, paths: Sequence[Path]) -> None:
         """Let a later try find these files of that folder, and none that were kept before.
 
         A bucket that is away does not end the job: it keeps them the next time.
         """
-        client = client_of(self.place)
-        with suppress(MagicError), tempfile.NamedTemporaryFile(dir=self.scratch) as file:
+        client, folder = client_of(self.place), paths[0].parent
+        with suppress(MagicError), tempfile.NamedTemporaryFile(dir=folder) as file:
             with tarfile.open(fileobj=file, mode="w") as tar:
                 for path in paths:
                     tar.add(path, path.name)
@@ -217,11 +218,10 @@ class BucketDelivery:
             client.run("put", client.files._pipe_file(path, json.dumps(progress).encode()))
 
     def progress(self) -> Progress | None:
-        """What was last reported; for the server."""
-        try:
+        """What was last reported; for the server. A bucket that is away does not end the job."""
+        with suppress(MagicError):
             return _parsed(whole(client_of(self.place), f"{self.beginning}{_PROGRESS}"))
-        except NotFound:
-            return None
+        return None
 
     def clear(self) -> None:
         """Remove what the job left; for the server. What cannot be removed now goes at a start."""
@@ -302,6 +302,38 @@ def spaced_keeping(delivery: Delivery, paths: Callable[[], Sequence[Path]]) -> C
             kept = time.monotonic()
 
     return keep
+
+
+@contextmanager
+def _own_folder(scratch: Path) -> Iterator[Path]:
+    """A new folder, which is gone afterwards.
+
+    A job that nobody wants any more is ended with its process: what that left goes with the next.
+    """
+    scratch.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        with (scratch / "lock").open("a") as gate:
+            with suppress(OSError):  # a disk without locks: nothing that is left is removed
+                fcntl.flock(gate, fcntl.LOCK_EX)
+            for left in scratch.glob("job-*"):
+                with suppress(OSError), _locked(left):
+                    shutil.rmtree(left)
+            own = tempfile.TemporaryDirectory(prefix="job-", dir=scratch)
+            folder = Path(stack.enter_context(own))
+            with suppress(OSError):
+                stack.enter_context(_locked(folder))
+        yield folder
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock, as long as this process lives; OSError where another has it."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _parsed(data: bytes) -> Progress | None:

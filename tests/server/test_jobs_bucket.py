@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+import subprocess
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -114,6 +117,41 @@ def test_keeping_nothing_new_while_the_bucket_is_away_does_not_end_a_job(
         delivery.keep([folder / "plan.json"])
     with delivery.working() as folder:
         assert (folder / "plan.json").read_text() == "later"
+
+
+def test_how_far_a_job_is_can_be_asked_while_the_bucket_is_away(
+    bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
+) -> None:
+    delivery = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
+    assert delivery.progress() is None
+    delivery.report((0.5, "half"))
+    with bucket_server.away():
+        assert delivery.progress() is None
+    assert delivery.progress() == (0.5, "half")
+
+
+_ENDED_JOB = """
+import os, sys
+from pathlib import Path
+from magic_server.jobs.delivery import BucketDelivery
+with BucketDelivery(None, "jobs/merge-7/", Path(sys.argv[1])).working() as folder:
+    (folder / "block").write_bytes(b"refined")
+    os.kill(os.getpid(), 15)
+"""
+
+
+def test_what_a_job_left_that_was_ended_with_its_process_goes_with_the_next(
+    place: BucketPlace, tmp_path: Path
+) -> None:
+    ended = subprocess.run([sys.executable, "-c", _ENDED_JOB, str(tmp_path)], timeout=300)
+    assert ended.returncode == -signal.SIGTERM
+    (left,) = tmp_path.glob("job-*")
+    with lasting(place, tmp_path).working() as first:
+        assert not left.exists()
+        with lasting(place, tmp_path).working() as second:
+            assert {first, second} == set(tmp_path.glob("job-*"))
+        assert first.is_dir()
+    assert not list(tmp_path.glob("job-*"))
 
 
 def test_what_was_kept_and_is_damaged_is_not_gone_on_with(
