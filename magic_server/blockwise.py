@@ -14,7 +14,7 @@ from typing import Any
 
 from magicslam.v1 import submap_pb2
 
-from magic_server.globalmap.blocks import ROUNDS, Block, blocks_near, blocks_showing
+from magic_server.globalmap.blocks import ROUNDS, Neighbours
 from magic_server.jobs import JobExecutor
 from magic_server.jobs.blockwise import (
     BesideTask,
@@ -73,7 +73,7 @@ class BlockwiseMerge:
         """The merged map; the first error of any job ends all."""
         plan = PlanTask(self._task.submaps, self._task.config, self._planning)
         planned = await self._jobs.run(plan_merge, plan)
-        blocks = [one.block for one in planned]
+        neighbours = Neighbours([one.block for one in planned])
         first, *others = ROUNDS
         self._begin_round("refining", len(planned), first)
         tasks = [
@@ -85,7 +85,7 @@ class BlockwiseMerge:
             beside = [
                 BesideTask(
                     self._block_task(block, f"beside-{count}-{i:04d}", span), i, span[0],
-                    self._refined(made, blocks, [i, *blocks_near(blocks, i)]),
+                    self._refined(made, neighbours, [i, *neighbours.near(i)]),
                 )
                 for i, block in enumerate(planned)
             ]  # fmt: skip
@@ -93,7 +93,7 @@ class BlockwiseMerge:
             made = await self._each(refine_block_beside, given)
         self._round = "joining blocks"
         joining = JoinTask(
-            tuple(self._refined(made, blocks, [i]) for i in range(len(blocks))),
+            tuple(self._refined(made, neighbours, [i]) for i in range(len(planned))),
             self._task.config,
             self._deliveries.of(self._folder / "join", lasting=True),
         )
@@ -117,12 +117,11 @@ class BlockwiseMerge:
         )
 
     def _refined(
-        self, made: Sequence[BlockOutcome], blocks: Sequence[Block], numbers: Sequence[int]
+        self, made: Sequence[BlockOutcome], neighbours: Neighbours, numbers: Sequence[int]
     ) -> RefinedBlocks:
         """Some blocks after a round, with what others made of them."""
         own = {number: self._streamed(made[number].own) for number in numbers}
-        others = sorted({other for number in numbers for other in blocks_showing(blocks, number)})
-        handed = [made[other].handed for other in others]
+        handed = [made[other].handed for other in neighbours.showing(numbers)]
         return RefinedBlocks(own, [self._streamed(one) for one in handed if one is not None])
 
     def _streamed(self, made: MadeFile) -> StreamedFile:
@@ -156,16 +155,17 @@ class BlockwiseMerge:
 
     def progress(self) -> Progress:
         """Share done, the sum over the blocks, and stage. For a thread."""
-        said = {number: delivery.progress() for number, delivery in list(self._begun.items())}
+        # First: blocks and rounds end while a bucket is asked for what was said.
+        stage, before, part = self._round, self._before, self._share
+        ended, count, begun = self._done, self._count, list(self._begun.items())
+        said = {number: delivery.progress() for number, delivery in begun}
         known = {number: report for number, report in said.items() if report is not None}
         stages = [f"block {n + 1} {text}" for n, (_, text) in sorted(known.items())[:3]]
-        stage = self._round
-        if self._count:
-            done = self._done + sum(share for share, _ in known.values())
+        if count:
+            done = ended + sum(share for share, _ in known.values())
             # A block that is begun again elsewhere says less than before.
-            share = self._before + self._share * min(1.0, done / self._count)
-            self._told = max(self._told, share)
-            stage = f"{self._round}, {self._done} of {self._count} blocks done"
+            self._told = max(self._told, before + part * min(1.0, done / count))
+            stage = f"{stage}, {ended} of {count} blocks done"
         elif (planned := self._planning.progress()) is not None:
             self._told = max(self._told, _PLANNED * planned[0])
         return self._told, "; ".join([stage, *stages])

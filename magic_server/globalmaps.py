@@ -177,7 +177,7 @@ class GlobalMaps:
         folder = self._folder_of(operation)
         await self._in_thread(lambda: folder.mkdir(exist_ok=True))
         delivery = self._delivery(folder)
-        ours = True
+        ours, ended = True, False
         try:
             try:
                 task = await self._task(coordinator, chosen, request, delivery)
@@ -186,14 +186,16 @@ class GlobalMaps:
                 _require_all(coordinator, chosen, error)
                 raise
             await self._keep(operation, session, snapshot.revision, chosen, outcome)
+            ended = True
         except HeldElsewhere:
             ours = False
             raise
         finally:
-            if not self._closing:  # a server that stops keeps what it has, to go on from there
-                if ours and asyncio.current_task() not in self._handed_on:
-                    await asyncio.shield(self._in_thread(delivery.clear))
-                await asyncio.shield(self._in_thread(shutil.rmtree, folder, True))
+            ours = ours and asyncio.current_task() not in self._handed_on
+            # A server that stops keeps what it has, to go on from there.
+            if ended or not self._closing:
+                left = delivery if ours else None
+                await asyncio.shield(self._in_thread(_clear, folder, left))
 
     def _delivery(self, folder: Path) -> Delivery:
         return self._deliveries.of(folder, lasting=True)
@@ -302,6 +304,13 @@ class GlobalMaps:
 
     async def _in_thread(self, function, *arguments):
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _clear(folder: Path, delivery: Delivery | None) -> None:
+    """Remove a merge's folder, and what its jobs left."""
+    if delivery is not None:
+        delivery.clear()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 async def _ended(tasks: set[asyncio.Task[None]]) -> None:

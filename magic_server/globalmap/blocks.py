@@ -8,6 +8,7 @@ only its own are kept (the scheme of VastGaussian, Lin et al., CVPR 2024). No bo
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -52,7 +53,7 @@ class ViewPlace:
     @property
     def step(self) -> int:
         """Pixels between samples."""
-        return _sample_step(self.size[0])
+        return _sample_step(*self.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +89,14 @@ class Block:
 
     def touches(self, low: Point, high: Point) -> bool:
         """Whether it may want points of a box."""
-        inside = (high >= self.low) & (low < self.high)
-        near = (high >= self.reach_low) & (low <= self.reach_high)
-        return bool(inside.all() or near.all())
+        return bool(_touching(self, low, high))
+
+
+def _touching(block: Block, low: Point, high: Point) -> NDArray[np.bool_]:
+    """(n,) whether a block may want points of each box (n, 3)."""
+    inside = (high >= block.low) & (low < block.high)
+    near = (high >= block.reach_low) & (low <= block.reach_high)
+    return np.asarray(inside.all(axis=-1) | near.all(axis=-1))
 
 
 def places_of(sources: Sequence[PlacedSource]) -> list[ViewPlace]:
@@ -111,9 +117,7 @@ def _samples(camera: Camera, depth: NDArray) -> tuple[NDArray[np.int64], NDArray
     Where depth is unknown it is that of the nearest sample with depth."""
     from scipy.spatial import KDTree
 
-    step = _sample_step(camera.width)
-    rows, columns = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    pixels = _sampled(camera.width, camera.height)
     measured = depth[pixels[:, 1], pixels[:, 0]]
     known = measured > 0
     if not known.any():
@@ -123,49 +127,71 @@ def _samples(camera: Camera, depth: NDArray) -> tuple[NDArray[np.int64], NDArray
     return pixels, camera.rays()[pixels[:, 1], pixels[:, 0]] * metres[:, None]
 
 
-def _sample_step(width: int) -> int:
-    return max(width // _SAMPLES_ACROSS, 1)
+@functools.lru_cache(maxsize=16)
+def _sampled(width: int, height: int) -> NDArray[np.int64]:
+    """Pixels spread over an image; the same array for all keyframes of a size."""
+    step = _sample_step(width, height)
+    rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    return np.stack([columns.ravel(), rows.ravel()], axis=1)
+
+
+def _sample_step(width: int, height: int) -> int:
+    return max(min(width // _SAMPLES_ACROSS, height), 1)
 
 
 def plan_blocks(places: Sequence[ViewPlace], *, most_views: int) -> list[Block]:
     """Boxes that fill space without overlap, each with at most `most_views` keyframes of its own,
     and parts of others that are as many images together."""
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
-    boxes = _split(list(places), *everywhere, most_views=most_views)
-    return [_with_guests(own, low, high, places, most=most_views) for own, low, high in boxes]
+    centres = np.stack([place.centre for place in places])
+    boxes = _split(centres, np.arange(len(places)), *everywhere, most_views=most_views)
+    lowest = np.stack([place.seen.min(axis=0) for place in places])
+    highest = np.stack([place.seen.max(axis=0) for place in places])
+    blocks = []
+    for own, low, high in boxes:
+        # Most keyframes look nowhere near, and their samples need not be gone through.
+        near = np.asarray(((highest >= low) & (lowest < high)).all(axis=1))
+        near[own] = True
+        blocks.append(_with_guests(own, low, high, places, np.flatnonzero(near), most=most_views))
+    return blocks
 
 
 def _split(
-    places: list[ViewPlace], low: Point, high: Point, *, most_views: int
-) -> list[tuple[list[ViewPlace], Point, Point]]:
-    if len(places) <= most_views:
-        return [(places, low, high)]
-    centres = np.stack([place.centre for place in places])
-    axis = int(np.ptp(centres, axis=0).argmax())
-    order = np.argsort(centres[:, axis], kind="stable")
-    middle = len(places) // 2
-    cut = 0.5 * float(centres[order[middle - 1], axis] + centres[order[middle], axis])
+    centres: Point, numbers: NDArray[np.intp], low: Point, high: Point, *, most_views: int
+) -> list[tuple[NDArray[np.intp], Point, Point]]:
+    """Boxes, each with the numbers of its keyframes."""
+    if len(numbers) <= most_views:
+        return [(numbers, low, high)]
+    chosen = centres[numbers]
+    axis = int(np.ptp(chosen, axis=0).argmax())
+    order = np.argsort(chosen[:, axis], kind="stable")
+    middle = len(numbers) // 2
+    cut = 0.5 * float(chosen[order[middle - 1], axis] + chosen[order[middle], axis])
     below, above = high.copy(), low.copy()
     below[axis], above[axis] = cut, cut
-    first = [places[i] for i in order[:middle]]
-    second = [places[i] for i in order[middle:]]
     return [
-        *_split(first, low, below, most_views=most_views),
-        *_split(second, above, high, most_views=most_views),
+        *_split(centres, numbers[order[:middle]], low, below, most_views=most_views),
+        *_split(centres, numbers[order[middle:]], above, high, most_views=most_views),
     ]
 
 
 def _with_guests(
-    own: list[ViewPlace], low: Point, high: Point, places: Sequence[ViewPlace], *, most: int
+    own: NDArray[np.intp],
+    low: Point,
+    high: Point,
+    places: Sequence[ViewPlace],
+    near: NDArray[np.intp],
+    *,
+    most: int,
 ) -> Block:
-    mine = {(place.source, place.keyframe) for place in own}
-    inside = [_inside(place.seen, low, high) for place in places]
-    ranked = sorted(range(len(places)), key=lambda number: -inside[number].mean())
+    """A box with its keyframes, and those of the ones `near` that look into it."""
+    mine = set(own.tolist())
+    inside = {number: _inside(places[number].seen, low, high) for number in near.tolist()}
+    shares = {number: float(chosen.mean()) for number, chosen in inside.items()}
     views, seen, room = [], [], float(most)
-    for number in ranked:
-        place, share = places[number], float(inside[number].mean())
-        is_mine = (place.source, place.keyframe) in mine
-        if not is_mine and (share < _GUEST_SHARE or room <= 0.0):
+    for number in sorted(inside, key=lambda number: -shares[number]):
+        place, is_mine = places[number], number in mine
+        if not is_mine and (shares[number] < _GUEST_SHARE or room <= 0.0):
             continue
         window = _window(place, inside[number])
         shown = _within(place, window)
@@ -207,15 +233,18 @@ def _inside(points: NDArray, low: NDArray, high: NDArray) -> NDArray[np.bool_]:
     return np.asarray(((points >= low) & (points < high)).all(axis=1))
 
 
-def blocks_near(blocks: Sequence[Block], number: int) -> list[int]:
-    """The other blocks that a block's keyframes may show."""
-    block = blocks[number]
-    others = (i for i in range(len(blocks)) if i != number)
-    return [i for i in others if block.touches(blocks[i].low, blocks[i].high)]
+class Neighbours:
+    """Which blocks' keyframes may show which others; found for all at once, as there are many."""
 
+    def __init__(self, blocks: Sequence[Block]) -> None:
+        low, high = (np.stack([getattr(b, name) for b in blocks]) for name in ("low", "high"))
+        self._shows = np.stack([_touching(block, low, high) for block in blocks])
+        np.fill_diagonal(self._shows, False)
 
-def blocks_showing(blocks: Sequence[Block], number: int) -> list[int]:
-    """The other blocks whose keyframes may show a block's Gaussians."""
-    block = blocks[number]
-    others = (i for i in range(len(blocks)) if i != number)
-    return [i for i in others if blocks[i].touches(block.low, block.high)]
+    def near(self, number: int) -> list[int]:
+        """The other blocks that a block's keyframes may show."""
+        return np.flatnonzero(self._shows[number]).tolist()
+
+    def showing(self, numbers: Sequence[int]) -> list[int]:
+        """The blocks whose keyframes may show the Gaussians of any of these that are others'."""
+        return np.flatnonzero(self._shows[:, list(numbers)].any(axis=1)).tolist()

@@ -21,8 +21,7 @@ from magic_server.globalmap import rounds
 from magic_server.globalmap.blocks import (
     ROUNDS,
     Block,
-    blocks_near,
-    blocks_showing,
+    Neighbours,
     places_of,
     plan_blocks,
 )
@@ -147,10 +146,11 @@ def _in_blocks(
         )
         for number in numbers
     ]  # fmt: skip
+    neighbours = Neighbours(blocks)
     for count, span in enumerate(others, start=1):
         made = parts.beside(f"round-{count}")
         for number in numbers:
-            around = dict(_agreed(blocks, parts, [number, *blocks_near(blocks, number)]))
+            around = _agreed(neighbours, parts, [number, *neighbours.near(number)])
             found = rounds.refine_beside(
                 blocks[number], around, made, sources, config, number=number, span=span,
                 progress=part(number, span, "border of block"),
@@ -159,7 +159,7 @@ def _in_blocks(
         parts = made
     joined = parts.beside("joined")
     for number in numbers:
-        ((_, cloud),) = _agreed(blocks, parts, [number])
+        ((_, cloud),) = _agreed(neighbours, parts, [number])
         shown = rounds.visible(cloud, config)
         faded = figures[number]["pruned"] + len(cloud) - len(shown)
         figures[number] |= {"gaussians": len(shown), "pruned": faded}
@@ -168,10 +168,10 @@ def _in_blocks(
 
 
 def _agreed(
-    blocks: Sequence[Block], parts: Parts, numbers: Sequence[int]
+    neighbours: Neighbours, parts: Parts, numbers: Sequence[int]
 ) -> Iterator[tuple[int, GaussianCloud]]:
     """Blocks as all agreed on them after the round that `parts` holds."""
-    others = sorted({other for number in numbers for other in blocks_showing(blocks, number)})
+    others = neighbours.showing(numbers)
     handed = (guest for other in others for guest in parts.guests(other, owners=numbers))
     return rounds.agreed_blocks(numbers, parts.cloud, handed)
 

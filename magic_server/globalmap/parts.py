@@ -10,6 +10,7 @@ open_0004.json      how far that is
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import uuid
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magic_core.config import to_mapping
 from magic_core.gaussians import GaussianCloud, codec
@@ -41,7 +43,7 @@ class Parts:
         if not plan.is_file() or plan.read_text() != json.dumps(fingerprint):
             for pattern in ("block_*", "guests_*", "open_*"):
                 for leftover in folder.glob(pattern):
-                    leftover.unlink()
+                    leftover.unlink(missing_ok=True)
             _replace(plan, json.dumps(fingerprint).encode())
 
     def beside(self, name: str) -> Parts:
@@ -88,7 +90,7 @@ class Parts:
         _replace(self.path(block), codec.encode_lossless(cloud))
         _replace(self._folder / f"block_{block:04d}.json", json.dumps(figures).encode())
         for leftover in self._folder.glob(f"open_{block:04d}.*"):
-            leftover.unlink()
+            leftover.unlink(missing_ok=True)  # by an earlier try that is not dead
 
     def checkpoint(self, block: int, cloud: GaussianCloud, figures: dict[str, Any]) -> None:
         """Keep how far the block under way is. Adam's moments are not kept: they come back in a
@@ -108,18 +110,24 @@ class Parts:
 
 def files_of(folder: Path) -> list[Path]:
     """All that an interrupted merge goes on from in a folder: a job's, of one block."""
-    patterns = ("plan.json", "block_????.*", "guests_????.*", "open_????.*")
+    patterns = ("plan.json", "block_*", "guests_*", "open_*")
     found = sorted(path for pattern in patterns for path in folder.glob(pattern))
     return [path for path in found if path.suffix != ".partial"]
 
 
 def fingerprint_of(sources: Sequence[PlacedSource], config: MergeConfig) -> str:
-    """A digest of where the sub-maps are and how they are merged."""
-    digest = hashlib.sha256(json.dumps(to_mapping(config), sort_keys=True).encode())
+    """A digest of where the sub-maps are and how they are merged, on whichever machine."""
+    anywhere = to_mapping(dataclasses.replace(config, threads=0))
+    digest = hashlib.sha256(json.dumps(anywhere, sort_keys=True).encode())
     for source in sources:
-        digest.update(source.world_from_anchor.tobytes())
-        digest.update(np.stack(source.keyframe_poses()).tobytes())
+        digest.update(rounded(source.world_from_anchor, 9))
+        digest.update(rounded(np.stack(source.keyframe_poses()), 9))
     return digest.hexdigest()
+
+
+def rounded(numbers: NDArray[np.float64], digits: int) -> bytes:
+    """Numbers for a digest that is to be the same on processors that differ in the last bits."""
+    return (np.round(numbers, digits) + 0.0).astype("<f8").tobytes()  # minus zero is zero
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

@@ -86,11 +86,11 @@ class View:
         seen = dataclasses.replace(
             camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top
         )
-        return View(
+        return View(  # copies, which do not hold the rest
             seen,
             self.world_from_camera,
-            np.ascontiguousarray(self.colour[top:bottom, left:right]),
-            np.ascontiguousarray(self.depth[top:bottom, left:right]),
+            self.colour[top:bottom, left:right].copy(),
+            self.depth[top:bottom, left:right].copy(),
             self.share * seen.width * seen.height / (camera.width * camera.height),
         )
 

@@ -71,7 +71,7 @@ def refine_alone(
 
 def refine_beside(
     block: Block,
-    around: Mapping[int, GaussianCloud],
+    around: Iterable[tuple[int, GaussianCloud]],
     parts: Parts,
     sources: Sequence[PlacedSource],
     config: MergeConfig,
@@ -82,17 +82,18 @@ def refine_beside(
 ) -> Figures:
     """Refine a block beside others through a span of the schedule, and keep what it made.
 
-    `around` holds the agreed Gaussians of this block, by its number, and of those near it.
+    `around` gives the agreed Gaussians of this block, by its number, and of those near it; they are
+    taken one block after the other, so that memory holds what is wanted of each.
     """
     if (finished := parts.finished(number)) is not None:
         return finished
     progress(0.0, "refining beside its neighbours")
     views = _views_of(block, sources)
-    places = {
-        owner: np.arange(len(cloud)) if owner == number else _wanted(block, cloud)
-        for owner, cloud in around.items()
-    }
-    before = {owner: around[owner].select(chosen) for owner, chosen in places.items()}
+    places: dict[int, NDArray[np.intp]] = {}
+    before: dict[int, GaussianCloud] = {}
+    for owner, cloud in around:
+        chosen = np.arange(len(cloud)) if owner == number else _wanted(block, cloud)
+        places[owner], before[owner] = chosen, cloud.select(chosen)
     begin = GaussianCloud.concatenate(list(before.values()))
     order = morton_order(begin)
     begun = round(span[0] * budget_of(views, config))

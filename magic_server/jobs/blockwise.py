@@ -173,7 +173,7 @@ def refine_block_beside(task: BesideTask) -> BlockOutcome:
 
     def refine(parts: Parts, report: Progress) -> None:
         rounds.refine_beside(
-            block.block, dict(_agreed(task.around)), parts, sources, config, number=number,
+            block.block, _agreed(task.around), parts, sources, config, number=number,
             span=(task.begin, block.until), progress=report,
         )  # fmt: skip
 
@@ -242,11 +242,11 @@ def _made(path: Path, delivery: Delivery) -> MadeFile:
 
 def _named(block: Block, sources: list[StoredSource], config: MergeConfig, what: str) -> str:
     """A name that no job with another outcome has."""
-    from magic_server.globalmap.parts import fingerprint_of
+    from magic_server.globalmap.parts import fingerprint_of, rounded
 
     digest = hashlib.sha256(repr(block.views).encode())
     for corner in (block.low, block.high, block.reach_low, block.reach_high):
-        digest.update(corner.astype("<f8").tobytes())
+        digest.update(rounded(corner, 6))
     return f"{fingerprint_of(sources, config)} {digest.hexdigest()} {what}"
 
 

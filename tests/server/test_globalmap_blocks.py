@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from magic_core.gaussians import GaussianCloud
-from magic_core.geometry import se3
+from magic_core.geometry import Camera, se3
 from magic_core.render import Rasteriser
 from magic_server.globalmap import PlacedSubmap
-from magic_server.globalmap.blocks import ViewPlace, places_of, plan_blocks
+from magic_server.globalmap.blocks import Neighbours, ViewPlace, places_of, plan_blocks
 from magic_server.globalmap.exposure import ExposureModel
 from magic_server.globalmap.merge import build_global_map, merge_into
+from magic_server.globalmap.parts import fingerprint_of
 from magic_server.globalmap.placement import View, coarse_merge, views_of
 from tests.server.test_globalmap_merge import CAMERA, CONFIG, merge, psnr, submap
 from tests.small_world import look, render
@@ -92,6 +93,21 @@ def test_keyframes_of_other_blocks_are_bounded_by_what_they_show():
         assert sum(shares) <= own + 4 + 1
 
 
+def test_all_neighbours_are_those_that_each_block_touches():
+    blocks = plan_blocks([*row_of_places(30), *wall(20)], most_views=6)
+    neighbours, numbers = Neighbours(blocks), range(len(blocks))
+    for i in numbers:
+        touched = [
+            j for j in numbers if j != i and blocks[i].touches(blocks[j].low, blocks[j].high)
+        ]
+        assert neighbours.near(i) == touched
+        assert neighbours.showing([i]) == [j for j in numbers if i in neighbours.near(j)]
+    assert 0 < len(neighbours.near(0)) < len(blocks) - 1
+    assert neighbours.showing([0, 1]) == sorted(
+        {*neighbours.showing([0]), *neighbours.showing([1])}
+    )
+
+
 def test_a_part_of_a_view_shows_a_part_of_the_picture():
     placed = submap(0, 0.0, 0.0)
     view = views_of([placed])[0]
@@ -102,6 +118,9 @@ def test_a_part_of_a_view_shows_a_part_of_the_picture():
     np.testing.assert_allclose(shown, whole[12:47, 20:61], atol=2e-3)
     assert np.array_equal(part.colour, view.colour[12:47, 20:61])
     assert part.share == 41 * 35 / (view.camera.width * view.camera.height)
+    rows = view.part((0, 12, view.camera.width, 47))
+    assert rows.colour.base is None  # else it would hold the whole image
+    assert rows.depth.base is None
     smaller = part.part((1, 2, 11, 12))
     assert smaller.share == pytest.approx(100 / (view.camera.width * view.camera.height))
 
@@ -125,6 +144,37 @@ def test_where_depth_is_unknown_a_keyframe_looks_as_far_as_beside_it():
     centre = (placed.world_from_anchor @ keyframe.anchor_from_camera)[:3, 3]
     np.testing.assert_allclose(nowhere.seen - centre, 0.0, atol=1e-9)
     assert plan_blocks([nowhere], most_views=1)[0].views[0].window is None
+
+
+def test_of_an_image_that_is_a_narrow_band_something_is_looked_at():
+    placed = submap(0, 0.0, 0.0)
+    for width, height in ((1024, 16), (16, 1024), (1, 1)):
+        band = replace(
+            placed.submap.keyframes[0],
+            colour=np.zeros((height, width, 3), np.uint8),
+            depth=np.full((height, width), 2.0, np.float32),
+        )
+        camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2)
+        narrow = replace(placed, submap=replace(placed.submap, camera=camera, keyframes=(band,)))
+        (place,) = places_of([narrow])
+        assert len(place.seen) == len(place.pixels) >= 1
+        (block,) = plan_blocks([place], most_views=1)
+        assert block.views[0].window is None
+        assert np.isfinite(block.reach_low).all()
+
+
+def test_a_merge_is_the_same_on_machines_with_more_threads_and_other_last_bits():
+    placed = [submap(0, 0.0, 0.0)]
+    here, there = replace(CONFIG, threads=2), replace(CONFIG, threads=16)
+    assert fingerprint_of(placed, here) == fingerprint_of(placed, there)
+    (one,) = placed
+    last_bits = replace(one, world_from_anchor=one.world_from_anchor * (1.0 + 2.0**-51))
+    assert not np.array_equal(last_bits.world_from_anchor, one.world_from_anchor)
+    assert fingerprint_of([last_bits], here) == fingerprint_of(placed, there)
+    moved = replace(one, world_from_anchor=one.world_from_anchor * (1.0 + 1e-6))
+    assert fingerprint_of([moved], here) != fingerprint_of(placed, here)
+    other = replace(here, iterations=here.iterations + 1)
+    assert fingerprint_of(placed, here) != fingerprint_of(placed, other)
 
 
 def test_a_map_that_fits_is_one_block():
