@@ -108,11 +108,12 @@ def test_another_machine_goes_on_with_what_a_job_kept(place: BucketPlace, tmp_pa
 def test_keeping_nothing_new_while_the_bucket_is_away_does_not_end_a_job(
     bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
 ) -> None:
-    delivery = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
+    delivery = lasting(place, tmp_path / "one")
+    impatient = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
     with delivery.working() as folder:
         (folder / "plan.json").write_text("plan")
         with bucket_server.away():
-            delivery.keep([folder / "plan.json"])
+            impatient.keep([folder / "plan.json"])
         (folder / "plan.json").write_text("later")
         delivery.keep([folder / "plan.json"])
     with delivery.working() as folder:
@@ -122,11 +123,12 @@ def test_keeping_nothing_new_while_the_bucket_is_away_does_not_end_a_job(
 def test_how_far_a_job_is_can_be_asked_while_the_bucket_is_away(
     bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
 ) -> None:
-    delivery = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
+    delivery = lasting(place, tmp_path / "one")
+    impatient = lasting(dataclasses.replace(place, timeout_s=1.0), tmp_path / "one")
     assert delivery.progress() is None
     delivery.report((0.5, "half"))
     with bucket_server.away():
-        assert delivery.progress() is None
+        assert impatient.progress() is None
     assert delivery.progress() == (0.5, "half")
 
 
