@@ -215,7 +215,7 @@ class Solving:
 
     async def _publish(self, change: Change) -> None:
         revision = self.board.revision + 1
-        settled = not self._graph.online.unsettled
+        settled = not self._graph.online.wants_solve
         message = await self._in_thread(self._graph.message, change, revision)
         data = message.SerializeToString()
         if self._journal_is_long(len(data)):

@@ -209,7 +209,7 @@ def measure_graph(size: int, *, added: int, hierarchy: str) -> dict:
     started = time.process_time()
     regions = graph.outline().condensed() if graph.is_uncondensed else None
     condense_s = time.process_time() - started
-    optimum = settled(graph.counted()) if graph.bent else None
+    optimum = settled(graph.counted()) if graph.is_large else None
     settle_s = time.process_time() - started - condense_s
     graph.advance([], [], optimum, regions)
     begin_s = time.process_time() - started - condense_s - settle_s

@@ -180,7 +180,6 @@ class OnlineGraph:
         self._touched = self._told.unknown
         self._count_members()
         self.unsettled = bool(vertices) and not settled
-        self.bent = self.is_large
 
     def advance(
         self,
