@@ -173,6 +173,7 @@ class SubmapReceiver:
         if header.HasField("odometry"):
             previous = header.odometry.previous_index
             if await self._store.submaps.first_answer(agent, previous) is None:
+                await self._store.agents.agent(session, agent.name)  # or it is gone itself
                 name = names.submap_name(session, agent.name, previous)
                 raise WrongState(f"odometry refers to {name}, which is not stored; submit it first")
 

@@ -25,6 +25,7 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.loops import LoopConfig
 from magic_server.server import Server
+from magic_server.store import AgentRow, FirstAnswer
 from tests.postgresql import NewStore
 from tests.small_world import DIMENSION, MODEL_ID, make_submap, path
 from tests.stored import stored_files
@@ -300,6 +301,23 @@ async def test_concurrent_deletions_of_one_thing_delete_it_once(client: MagicCli
     )
     assert sum(not isinstance(answer, BaseException) for answer in answers) == 1
     assert sum(isinstance(answer, NotFound) for answer in answers) == 3
+
+
+async def test_an_agent_that_is_deleted_while_it_submits_is_not_found(
+    server: Server, client: MagicClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+    await client.submit_submap(make_submap(index=0, submaps=2))
+    answer = server._store.submaps.first_answer
+
+    async def deleted_before(agent: AgentRow, index: int) -> FirstAnswer | None:
+        if index == 0:  # asked for when sub-map 1 has said that it comes after it
+            await client.delete_agent("room", "agent_0", force=True)
+        return await answer(agent, index)
+
+    monkeypatch.setattr(server._store.submaps, "first_answer", deleted_before)
+    with pytest.raises(NotFound, match="agent_0"):
+        await client.submit_submap(make_submap(index=1, submaps=2))
 
 
 async def test_uploads_and_deletions_at_the_same_time_leave_no_file_that_nothing_refers_to(
