@@ -22,7 +22,7 @@ Point = NDArray[np.float64]
 
 _SAMPLES_ACROSS = 16  # an image: points that say what a keyframe looks at
 _GUEST_SHARE = 0.02  # of a keyframe's samples inside a box, for it to teach the box too
-_WIDER = 2  # samples by which a part is wider on all sides than what lies in the box
+_WIDER = 4  # samples by which a part is wider on all sides than what lies in the box
 _WHOLE = 0.8  # of an image: parts larger than this are taken as all of it
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
