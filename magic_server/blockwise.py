@@ -36,6 +36,8 @@ from magic_server.store.blob_store import StreamedFile
 
 _PLANNED = 0.05
 """Share of the progress when space is divided."""
+_REFINED = 0.97
+"""And when all blocks are refined."""
 
 
 def is_blockwise(task: MergeTask) -> bool:
@@ -101,8 +103,8 @@ class BlockwiseMerge:
 
     def _begin_round(self, name: str, count: int, span: tuple[float, float]) -> None:
         self._round, self._count, self._done = name, count, 0
-        self._before = _PLANNED + (1.0 - _PLANNED) * span[0]
-        self._share = (1.0 - _PLANNED) * (span[1] - span[0])
+        self._before = _PLANNED + (_REFINED - _PLANNED) * span[0]
+        self._share = (_REFINED - _PLANNED) * (span[1] - span[0])
 
     def _block_task(
         self, planned: PlannedBlock, folder: str, span: tuple[float, float]

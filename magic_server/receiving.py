@@ -188,7 +188,8 @@ class SubmapReceiver:
     async def _taken(self, upload: Upload, messages: Messages, claim: _Claim) -> None:
         """Receive what is missing.
 
-        A stream that breaks or ends early leaves what came; a refusal leaves nothing.
+        A stream that breaks or ends early leaves what came, however that shows; a refusal leaves
+        nothing.
         """
         claim.taking = asyncio.create_task(self._take(upload, messages))
         if claim.gave_way:  # asked for before there was anything to end
@@ -203,8 +204,11 @@ class SubmapReceiver:
             if claim.gave_way:
                 raise Unavailable("another stream of the same upload has taken over") from None
             raise
-        except BaseException:
+        except MagicError:
             await self._finish(self._in_thread(upload.partial.discard))
+            raise
+        except BaseException:  # gRPC's own, where a server stops while a caller goes away
+            await self._finish(self._kept(upload.partial))
             raise
 
     async def _take(self, upload: Upload, messages: Messages) -> None:

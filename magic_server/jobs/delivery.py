@@ -23,9 +23,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
-from magic_core.errors import MagicError, NotFound
+from magic_core.errors import MagicError, NotFound, Unavailable
 from magic_server.store import Store, WrittenBlob
 from magic_server.store.blob_store import StreamedFile
 from magic_server.store.blobs import LocalFile
@@ -41,6 +41,7 @@ from magic_server.store.bucket_client import BucketPlace, client_of
 
 logger = logging.getLogger(__name__)
 
+T = TypeVar("T")
 JobFile = Path | Delivered
 """A file that a job made, as the server finds it."""
 Progress = tuple[float, str]
@@ -50,6 +51,7 @@ _PROGRESS = "progress.json"
 _KEPT, _CONCLUDED = "kept.tar", "concluded.json"
 _FAR_PROGRESS_S = 2.0
 _FAR_KEEP_S = 60.0
+_PATIENCE_S, _AGAIN_S = 300.0, 2.0
 
 
 class OpenFile(Protocol):
@@ -156,7 +158,7 @@ class BucketDelivery:
         """The job's folder, for a block, with what an earlier try kept."""
         with _own_folder(self.scratch) as folder:
             if self.lasting:
-                self._restore(folder)
+                _patiently(lambda: self._restore(folder))
             yield folder
 
     def keep(self, paths: Sequence[Path]) -> None:
@@ -191,7 +193,7 @@ class BucketDelivery:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         # Under a name of its own: an earlier try may still be writing.
         key = f"{self.beginning}{uuid.uuid4().hex}"
-        put_file(client_of(self.place), path, key)
+        _patiently(lambda: put_file(client_of(self.place), path, key))
         return Delivered(key, digest, path.stat().st_size)
 
     def conclude(self, name: str, files: Sequence[JobFile]) -> None:
@@ -200,12 +202,13 @@ class BucketDelivery:
         data = json.dumps({"name": name, "files": found}).encode()
         client = client_of(self.place)
         path = self.place.path(f"{self.beginning}{_CONCLUDED}")
-        client.run("put", client.files._pipe_file(path, data))
+        _patiently(lambda: client.run("put", client.files._pipe_file(path, data)))
 
     def concluded(self, name: str) -> Sequence[Delivered] | None:
         """What an earlier try at the job of this name delivered, where it came to its end."""
+        client, key = client_of(self.place), f"{self.beginning}{_CONCLUDED}"
         try:
-            said = json.loads(whole(client_of(self.place), f"{self.beginning}{_CONCLUDED}"))
+            said = json.loads(_patiently(lambda: whole(client, key)))
         except NotFound:
             return None
         return [Delivered(**file) for file in said["files"]] if said["name"] == name else None
@@ -334,6 +337,18 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _patiently(work: Callable[[], T]) -> T:
+    """Do what a job cannot end without, again while the bucket is away: hours may be behind it."""
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return work()
+        except Unavailable:
+            if time.monotonic() > end:
+                raise
+            time.sleep(_AGAIN_S)
 
 
 def _parsed(data: bytes) -> Progress | None:

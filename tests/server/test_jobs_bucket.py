@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from magic_core.tracing import TracingConfig
 from magic_server.jobs import JobConfig, JobExecutor, new_executor
 from magic_server.jobs.delivery import BucketDelivery
 from magic_server.store import BlobWriter
-from magic_server.store.bucket import BucketBlob, BucketBlobs, bucket_of
+from magic_server.store.bucket import BucketBlob, BucketBlobs, Delivered, bucket_of
 from magic_server.store.bucket_client import BucketPlace
 from tests.bucket import BucketServer
 from tests.cluster import Cluster
@@ -178,3 +179,19 @@ def test_a_job_that_came_to_its_end_is_found_by_its_name_alone(
     assert delivery.concluded("block under other poses") is None
     delivery.clear()
     assert delivery.concluded("block as planned") is None
+
+
+def test_a_job_that_is_done_waits_for_a_bucket_that_is_away(
+    bucket_server: BucketServer, place: BucketPlace, tmp_path: Path
+) -> None:
+    delivery = lasting(place, tmp_path / "one")
+    with delivery.working() as folder, ThreadPoolExecutor(1) as thread:
+        (folder / "block").write_bytes(b"refined")
+        with bucket_server.away():
+            delivering = thread.submit(delivery.deliver, folder / "block")
+            with pytest.raises(TimeoutError):
+                delivering.result(timeout=1.0)
+        file = delivering.result(timeout=120.0)
+        assert isinstance(file, Delivered)
+        delivery.conclude("block", [file])
+    assert delivery.concluded("block") == [file]

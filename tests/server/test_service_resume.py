@@ -161,7 +161,6 @@ async def test_a_server_that_was_killed_goes_on_with_what_had_come(
         sending.cancel()
         await asyncio.gather(sending, return_exceptions=True)
     for file, data in left.items():
-        file.parent.mkdir(exist_ok=True)
         file.write_bytes(data)
     async with Server(server_config) as second, MagicClient(second.address) as client:
         position = await client.resume_upload(NAME, "first")
@@ -169,6 +168,23 @@ async def test_a_server_that_was_killed_goes_on_with_what_had_come(
         receipt = await client.submit_encoded(submap, resume=True)
         assert not receipt.duplicate
         assert (await client.download_encoded(NAME)).blobs == submap.blobs
+
+
+async def test_a_stream_that_breaks_in_an_unheard_of_way_leaves_what_came(
+    registered: MagicClient, server: Server
+) -> None:
+    sent = messages(encoded())[:20]
+
+    async def broken() -> AsyncIterator[mapping_pb.SubmitSubmapRequest]:
+        for message in sent:
+            yield message
+        raise RuntimeError("the transport is gone")
+
+    with pytest.raises(RuntimeError, match="the transport is gone"):
+        await server._receiver.receive(broken(), on_stored=lambda agent, vertex: None)
+    assert server_kept(server) == (1, payload(sent))
+    position = await registered.resume_upload(NAME, "first")
+    assert position.durable_bytes == payload(sent)
 
 
 async def test_bytes_that_the_disk_lost_are_sent_again(server_config: ServerConfig) -> None:
