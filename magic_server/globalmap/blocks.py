@@ -22,7 +22,7 @@ Point = NDArray[np.float64]
 
 _SAMPLES_ACROSS = 16  # an image: points that say what a keyframe looks at
 _GUEST_SHARE = 0.02  # of a keyframe's samples inside a box, for it to teach the box too
-_WIDER = 4  # samples by which a part is wider on all sides than what lies in the box
+_WIDER = 3  # samples by which a part is wider on all sides than what lies in the box
 _WHOLE = 0.8  # of an image: parts larger than this are taken as all of it
 _REACH_PERCENTILE = 2.0  # stray samples do not make a box's surroundings wide
 _MARGIN_M = 0.3
@@ -141,7 +141,7 @@ def _sample_step(width: int, height: int) -> int:
 
 def plan_blocks(places: Sequence[ViewPlace], *, most_views: int) -> list[Block]:
     """Boxes that fill space without overlap, each with at most `most_views` keyframes of its own,
-    and parts of others that are as many images together."""
+    and parts of others that add up to at most one and a half times as many images."""
     everywhere = (np.full(3, -np.inf), np.full(3, np.inf))
     centres = np.stack([place.centre for place in places])
     boxes = _split(centres, np.arange(len(places)), *everywhere, most_views=most_views)
@@ -152,7 +152,11 @@ def plan_blocks(places: Sequence[ViewPlace], *, most_views: int) -> list[Block]:
         # Most keyframes look nowhere near, and their samples need not be gone through.
         near = np.asarray(((highest >= low) & (lowest < high)).all(axis=1))
         near[own] = True
-        blocks.append(_with_guests(own, low, high, places, np.flatnonzero(near), most=most_views))
+        blocks.append(
+            _with_guests(
+                own, low, high, places, np.flatnonzero(near), most=most_views + most_views // 2
+            )
+        )
     return blocks
 
 
