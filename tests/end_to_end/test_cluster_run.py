@@ -15,7 +15,7 @@ from magic_server.config import ListenConfig, ServerConfig
 from magic_server.coordinator import SessionCoordinator
 from magic_server.globalmap import MergeConfig
 from magic_server.jobs import JobConfig
-from magic_server.posegraph.online import NOTICEABLE_M
+from magic_server.posegraph.telling import NOTICEABLE_M
 from magic_server.server import Server
 from tests.cluster import Cluster, running_cluster
 from tests.end_to_end.conftest import Processes
