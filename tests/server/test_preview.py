@@ -11,6 +11,7 @@ from magic_agent.client import MagicClient
 from magic_core.errors import NotFound
 from magic_core.gaussians import GaussianCloud
 from magic_core.gaussians.ply import read_ply
+from magic_core.submap import Submap
 from magic_server.config import ListenConfig, ServerConfig
 from magic_server.jobs import JobConfig
 from magic_server.preview_config import PreviewConfig
@@ -129,19 +130,25 @@ async def placed(client: MagicClient, count: int):
     return info, await client.get_global_map(PREVIEW)
 
 
+async def one_placed(client: MagicClient) -> Submap:
+    """A sub-map that the pose graph has placed."""
+    await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
+    submap = make_submap(agent=0, index=0)
+    await client.submit_submap(submap)
+
+    async def is_placed() -> bool:
+        return bool((await client.get_corrected_poses("room")).poses)
+
+    await eventually(is_placed)
+    return submap
+
+
 async def test_without_following_it_is_made_when_asked_for(
     tmp_path, new_store: NewStore, jobs: JobConfig
 ):
     server_config = config_of(tmp_path, new_store(), jobs, enabled=False)
     async with Server(server_config) as server, MagicClient(server.address) as client:
-        await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
-        submap = make_submap(agent=0, index=0)
-        await client.submit_submap(submap)
-
-        async def is_placed() -> bool:
-            return bool((await client.get_corrected_poses("room")).poses)
-
-        await eventually(is_placed)
+        submap = await one_placed(client)
         await asyncio.sleep(0)
         assert not (tmp_path / "previews").exists()
         assert len(await client.get_global_map(PREVIEW)) == len(submap.gaussians)
@@ -154,14 +161,7 @@ async def test_a_preview_whose_asker_leaves_is_made_and_kept(
 ):
     server_config = config_of(tmp_path, new_store(), jobs, enabled=False)
     async with Server(server_config) as server, MagicClient(server.address) as client:
-        await client.register_agent("room", "agent_0", model_id=MODEL_ID, dimension=DIMENSION)
-        submap = make_submap(agent=0, index=0)
-        await client.submit_submap(submap)
-
-        async def is_placed() -> bool:
-            return bool((await client.get_corrected_poses("room")).poses)
-
-        await eventually(is_placed)
+        submap = await one_placed(client)
         begun, go_on, run, count = asyncio.Event(), asyncio.Event(), server._jobs.run, 0
 
         async def held_up(function, /, *arguments):

@@ -49,6 +49,13 @@ def new_submap(submap: Submap, store: Store) -> tuple[NewSubmap, list[BlobWriter
     ), blobs
 
 
+async def put(store: Store, submap: Submap) -> None:
+    """A sub-map of an agent that is there, stored."""
+    agent = await store.agents.agent(submap.session, submap.agent)
+    made, blobs = new_submap(submap, store)
+    await store.add_submap(agent, made, blobs, now=2.0)
+
+
 async def registered(store: Store, agent: str = "agent_0"):
     asked = Asked(uuid.uuid4().hex, bytes(32), 1.0)
     entered = await store.agents.register(
